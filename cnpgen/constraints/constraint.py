@@ -1,0 +1,92 @@
+"""The contract of a constraint: a named condition on a robot state, in two independent forms."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.schema import field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.symbolic import SymbolicState
+    from cnpgen.verify.world import World
+
+End = Literal["start", "goal"]
+
+# How exactly a boundary state must meet its conditions, by the type that it is stored in. Limits are relative, the rest is SI.
+EXACTNESS: dict[str, dict[str, float]] = {
+    "float64": {"limit": 1e-12, "position": 1e-8, "angle": 1e-8, "velocity": 1e-9, "acceleration": 1e-9},
+    "float32": {"limit": 1e-12, "position": 1e-6, "angle": 1e-5, "velocity": 1e-5, "acceleration": 1e-4},
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """``lower <= g <= upper`` on one state.
+
+    Attributes:
+        name: What it is about, for messages and reports.
+        unit: SI unit of g.
+        g: m values: SX scalars in the symbolic form, floats in the measured form.
+        lower: Lower bounds, shape (m,), -inf where there is none.
+        upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
+        exactness: Key of ``EXACTNESS``: how exactly a boundary state must meet it.
+        needs: The highest derivative of q that g depends on: 0, 1 or 2.
+    """
+
+    name: str
+    unit: str
+    g: list[Any]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    exactness: str
+    needs: int = 0
+
+    def slack(self, dtype: str) -> NDArray[np.float64]:
+        """How far g may be outside its bounds on a boundary state stored as ``dtype``, in the unit of g, shape (m,)."""
+        exact = EXACTNESS[dtype][self.exactness]
+        if self.exactness != "limit":
+            return np.full(len(self.g), exact)
+        size = np.maximum(np.abs(np.nan_to_num(self.lower, posinf=0, neginf=0)), np.abs(np.nan_to_num(self.upper, posinf=0, neginf=0)))
+        return exact * np.maximum(size, 1.0)
+
+    def violation(self) -> float:
+        """Return the worst ``max(lower - g, g - upper, 0)`` of a measured condition, in its unit; nan counts as infinite."""
+        g = np.array(self.g, float)
+        worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
+        return worst if np.isfinite(worst) else np.inf
+
+
+@dataclass(frozen=True, kw_only=True)
+class Constraint(ABC):
+    """One term of the constraint manifold: a condition on every state of a motion, and what it means at the motion's ends.
+
+    A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]`` table in ``problem.toml``; it is registered
+    under a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.constraints``.
+
+    Attributes:
+        reason: The name under which a sample that breaks the constraint is counted.
+    """
+
+    reason: ClassVar[str]
+
+    tolerance: float
+    budget: float = field("acceptable violation while training (the paper's C-bar^2)", low=0.0, default=0.0)
+
+    @abstractmethod
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the condition on a motion as SX expressions of the symbolic state."""
+
+    @abstractmethod
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate the same condition with Pinocchio and Coal at the state that ``world`` holds."""
+
+    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """State what a boundary state must meet; by default what every state must."""
+        return self.symbolic(state)
+
+    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """Evaluate what a boundary state must meet, with Pinocchio and Coal."""
+        return self.measured(world)

@@ -1,0 +1,84 @@
+"""Joint limits: position, velocity, acceleration and torque, each within the planning limits of the robot."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.constraints.constraint import Condition, Constraint
+from cnpgen.schema import field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.symbolic import SymbolicState
+    from cnpgen.verify.world import World
+
+
+def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64], needs: int) -> tuple[Condition, ...]:
+    return (Condition(name, unit, g, -limit, limit, "limit", needs),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPosition(Constraint):
+    """``lower <= q <= upper``."""
+
+    reason = "joint position limit"
+    tolerance: float = field("how far a motion may be off and still be called valid", unit="rad", low=0.0)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the limits on q [rad]."""
+        robot = state.robot
+        return (Condition("joint position", "rad", state.q, robot.position_lower, robot.position_upper, "limit"),)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Compare q [rad] with the limits."""
+        robot = world.robot
+        return (Condition("joint position", "rad", list(world.q), robot.position_lower, robot.position_upper, "limit"),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointVelocity(Constraint):
+    """``|dq| <= velocity limit``."""
+
+    reason = "joint velocity limit"
+    tolerance: float = field("how far a motion may be off and still be called valid", unit="rad/s", low=0.0)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the limits on dq [rad/s]."""
+        return _within("joint velocity", "rad/s", state.dq, state.robot.velocity_limit, 1)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Compare dq [rad/s] with the limits."""
+        return _within("joint velocity", "rad/s", list(world.dq), world.robot.velocity_limit, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointAcceleration(Constraint):
+    """``|ddq| <= acceleration limit``."""
+
+    reason = "joint acceleration limit"
+    tolerance: float = field("how far a motion may be off and still be called valid", unit="rad/s^2", low=0.0)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the limits on ddq [rad/s^2]."""
+        return _within("joint acceleration", "rad/s^2", state.ddq, state.robot.acceleration_limit, 2)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Compare ddq [rad/s^2] with the limits."""
+        return _within("joint acceleration", "rad/s^2", list(world.ddq), world.robot.acceleration_limit, 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTorque(Constraint):
+    """``|ID(q, dq, ddq)| <= torque limit``, payload included."""
+
+    reason = "joint torque limit"
+    tolerance: float = field("how far a motion may be off and still be called valid", unit="N m", low=0.0)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the limits on the inverse dynamics [N m]."""
+        return _within("joint torque", "N m", state.torque, state.robot.torque_limit, 2)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Compare Pinocchio's inverse dynamics [N m] with the limits."""
+        return _within("joint torque", "N m", list(world.torque), world.robot.torque_limit, 2)

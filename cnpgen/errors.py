@@ -1,0 +1,48 @@
+"""The exceptions that users may want to catch, and the exit codes they turn into."""
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+
+class CnpgenError(Exception):
+    """Base of everything cnpgen raises on purpose.
+
+    Attributes:
+        exit_code: What the command line exits with.
+    """
+
+    exit_code = 2
+
+
+class UsageError(CnpgenError):
+    """An argument or a combination of arguments that cannot be meant."""
+
+
+class RecipeError(CnpgenError):
+    """One or more mistakes in a problem, pipeline or dataset file.
+
+    Args:
+        mistakes: One line each, with file and key.
+    """
+
+    def __init__(self, mistakes: Sequence[str]) -> None:
+        self.mistakes = tuple(mistakes)
+        super().__init__("\n".join(self.mistakes))
+
+
+class DatasetError(CnpgenError):
+    """A dataset on disk that is damaged, unfinished or not what was asked for."""
+
+    exit_code = 1
+
+
+class MachineError(CnpgenError):
+    """The machine cannot do what is asked: no compiler, full disk, unwritable folder, a dead worker."""
+
+    exit_code = 3
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return ``" (did you mean 'x'?)"`` for the known name nearest to ``name``, or an empty string."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -1,0 +1,32 @@
+"""A field of a dataset: the name, shape, unit and meaning of one HDF5 dataset."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Field:
+    """One named column block of a shard, stored as ``(rows, width)`` or ``(rows,)`` when ``width`` is 0.
+
+    Attributes:
+        name: HDF5 dataset name at the root of the shard.
+        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1".
+        long_name: What it is, in a few words.
+        width: Number of columns; 0 for a scalar per row.
+        names: Names of the columns (joints, axes), empty for scalars.
+        role: "input", "target", "context" or "diagnostic".
+        frame: Reference frame of Cartesian fields, else "".
+        valid_min: Lower limit of every column, shape (max(width, 1),), or None.
+        valid_max: Upper limit of every column, or None.
+        dtype: "float" (stored in the dataset's float type) or "int64".
+    """
+
+    name: str
+    unit: str
+    long_name: str
+    width: int = 0
+    names: tuple[str, ...] = ()
+    role: str = "input"
+    frame: str = ""
+    valid_min: tuple[float, ...] | None = None
+    valid_max: tuple[float, ...] | None = None
+    dtype: str = "float"

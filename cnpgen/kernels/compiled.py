@@ -1,0 +1,136 @@
+"""Kernels as shared libraries: compiled once with the machine's C compiler, cached by content, called through ctypes."""
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from cnpgen.errors import MachineError
+from cnpgen.kernels.emit import PRELUDE, emit
+from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.tape import Tape
+
+FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w")
+COMPILE_SECONDS = 300
+
+
+class CompiledKernel(Kernel):
+    """A tape as machine code."""
+
+    def __init__(self, tape: Tape, library: Path) -> None:
+        super().__init__(tape)
+        try:
+            self._function = ctypes.CDLL(str(library)).kernel
+        except (OSError, AttributeError) as error:
+            raise MachineError(f"cannot load the compiled kernel {library}: {error}; delete it and run again") from error
+        self._function.restype = None
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate the batch; see ``Kernel``."""
+        n = check_arguments(self.tape, arguments)
+        results = [np.empty((width, n)) for width in self.tape.outputs]
+        if n:
+            strides = (ctypes.c_long * len(arguments))(*(argument.strides[0] // 8 for argument in arguments))
+            self._function(ctypes.c_long(n), _pointers(arguments), strides, _pointers(results))
+        return results
+
+
+def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
+    return (ctypes.c_void_p * len(arrays))(*(array.__array_interface__["data"][0] for array in arrays))
+
+
+@cache
+def find_compiler() -> str | None:
+    """Return the path of the C compiler: ``$CC``, then cc, gcc, clang; None where there is none."""
+    candidates = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
+    return next((path for path in map(shutil.which, candidates) if path), None)
+
+
+@cache
+def compiler_version(compiler: str) -> str:
+    """Return the first line of ``compiler --version``.
+
+    Raises:
+        MachineError: The compiler does not run.
+    """
+    try:
+        done = subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
+    return done.stdout.splitlines()[0].strip() if done.stdout else "unknown"
+
+
+@cache
+def target() -> str:
+    """Name the instruction set that kernels are compiled for; machines that share a cache must not share libraries."""
+    flags = ""
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        flags = next((line.split(":", 1)[1] for line in lines if line.lower().startswith(("flags", "features"))), "")
+    return f"{platform.system()}-{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:8]}"
+
+
+def vector_flags() -> tuple[str, ...]:
+    """Flags that let the compiler use this machine's vector instructions."""
+    if platform.machine() in ("arm64", "aarch64"):
+        return ("-mcpu=native",)
+    return ("-march=native",)
+
+
+@cache
+def _emitter_digest() -> str:
+    source = Path(emit.__code__.co_filename).read_bytes()
+    return hashlib.sha256(source + PRELUDE.encode()).hexdigest()
+
+
+def library_path(tape: Tape, cache_folder: Path, compiler: str) -> Path:
+    """Where the library of a tape is cached: named by everything that determines its content."""
+    identity = hashlib.sha256(tape.to_bytes())
+    for text in (*FLAGS, *vector_flags(), compiler_version(compiler), target(), _emitter_digest()):
+        identity.update(text.encode() + b"\0")
+    return cache_folder / "lib" / f"{tape.name}-{identity.hexdigest()[:24]}.so"
+
+
+def compile_tape(tape: Tape, cache_folder: Path) -> Path:
+    """Return the library of a tape, compiling it if it is not in the cache.
+
+    Raises:
+        MachineError: There is no working compiler or the cache folder cannot be written.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise MachineError("no C compiler found (looked for $CC, cc, gcc, clang)")
+    path = library_path(tape, cache_folder, compiler)
+    if path.exists():
+        return path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
+            source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"
+            source.write_text(emit(tape), encoding="utf-8")
+            _run_compiler(compiler, source, built)
+            built.replace(path)
+    except OSError as error:
+        raise MachineError(f"cannot write the kernel cache {path.parent}: {error.strerror or error}") from error
+    return path
+
+
+def _run_compiler(compiler: str, source: Path, built: Path) -> None:
+    command = [compiler, *FLAGS, *vector_flags(), str(source), "-o", str(built), "-lm"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise MachineError(f"{compiler} took more than {COMPILE_SECONDS} s for {source.name}") from error
+    except OSError as error:
+        raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
+    if done.returncode != 0 or not built.exists():
+        first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
+        raise MachineError(f"{compiler} failed with exit code {done.returncode}: {first or 'no message'}")

@@ -1,0 +1,134 @@
+"""Kernels without a compiler: the tape run by NumPy, one operation at a time on blocks that stay in the processor's cache."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.tape import NAMES, OPERATIONS, Loop, Tape
+
+BLOCK = 4096  # lanes; smaller blocks pay more for Python, larger ones fall out of the cache
+
+
+def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
+    out[...] = np.where(np.not_equal(condition, 0.0), value, 0.0)  # a product would turn 0 * inf into nan
+
+
+def _twice(x: Any, out: Array) -> None:
+    np.add(x, x, out=out)
+
+
+_APPLY: dict[str, Callable[..., Any]] = {
+    "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "NEG": np.negative, "SQ": np.square,
+    "TWICE": _twice, "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin, "COS": np.cos,
+    "EXP": np.exp, "FMIN": np.minimum, "FMAX": np.maximum, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
+    "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or, "IF_ELSE_ZERO": _if_else_zero,
+}  # fmt: skip
+_PLAIN = {"TWICE", "IF_ELSE_ZERO"}  # not ufuncs: no casting argument
+
+
+class InterpretedKernel(Kernel):
+    """A tape evaluated by NumPy."""
+
+    def __init__(self, tape: Tape) -> None:
+        super().__init__(tape)
+        self._slots, self._program = _allocate(tape)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate the batch; see ``Kernel``."""
+        n = check_arguments(self.tape, arguments)
+        with np.errstate(all="ignore"):
+            if self.tape.loop is not None:
+                return self._iterate(list(arguments), n, self.tape.loop)
+            return self._evaluate(arguments, n)
+
+    def _evaluate(self, arguments: "tuple[Array, ...] | list[Array]", n: int) -> list[Array]:
+        results = [np.empty((width, n)) for width in self.tape.outputs]
+        work = np.empty((self._slots, min(n, BLOCK)))
+        for start in range(0, n, BLOCK):
+            stop = min(start + BLOCK, n)
+            rows = [row[: stop - start] for row in work]
+            for step in self._program:
+                step(rows, arguments, results, start, stop)
+        return results
+
+    def _iterate(self, arguments: list[Array], n: int, loop: Loop) -> list[Array]:
+        """Step all lanes, then only those that have not converged."""
+        state, parameters = arguments[0].copy(), arguments[1:]
+        error = np.full((1, n), np.nan)
+        active = np.arange(n)
+        for _ in range(loop.limit):
+            if len(active) == 0:
+                break
+            every = len(active) == n
+            current = [state, *parameters] if every else [np.ascontiguousarray(x[:, active]) for x in (state, *parameters)]
+            following, now = self._evaluate(current, len(active))
+            state[:, active], error[:, active] = following, now
+            active = active[~(now[0] < loop.tolerance)]
+        return [state, error]
+
+
+Step = Callable[[list[Array], Any, list[Array], int, int], None]
+
+
+def _allocate(tape: Tape) -> tuple[int, list[Step]]:
+    """Assign work rows to values, reusing rows of dead ones, and bind every instruction to its operands."""
+    last = np.zeros(len(tape), int)
+    names = [NAMES[code] for code in tape.operation]
+    for k, name in enumerate(names):
+        for operand in _operands(tape, k, name):
+            last[operand] = k
+    free: list[int] = []
+    place: dict[int, Any] = {}  # value -> row, or the constant itself
+    count = 0
+    program: list[Step] = []
+    for k, name in enumerate(names):
+        if name == "CONST":
+            place[k] = tape.constant[k]
+            continue
+        operands = [place[operand] for operand in _operands(tape, k, name)]
+        for operand in set(_operands(tape, k, name)):
+            if last[operand] == k and isinstance(place[operand], int):
+                free.append(place[operand])
+        if name == "OUTPUT":
+            program.append(_bind_output(operands[0], int(tape.b[k]), int(tape.constant[k])))
+            continue
+        if free:
+            row = free.pop()
+        else:
+            row, count = count, count + 1
+        place[k] = row
+        program.append(_bind_input(row, int(tape.a[k]), int(tape.b[k])) if name == "INPUT" else _bind(name, operands, row))
+        if last[k] == 0:
+            free.append(row)
+    return max(count, 1), program
+
+
+def _operands(tape: Tape, k: int, name: str) -> list[int]:
+    return [int(tape.a[k]), int(tape.b[k])][: OPERATIONS[name]]
+
+
+def _bind_input(row: int, argument: int, component: int) -> Step:
+    def step(rows: list[Array], arguments: Any, _results: list[Array], start: int, stop: int) -> None:
+        np.copyto(rows[row], arguments[argument][component, start:stop])
+
+    return step
+
+
+def _bind_output(operand: Any, result: int, component: int) -> Step:
+    def step(rows: list[Array], _arguments: Any, results: list[Array], start: int, stop: int) -> None:
+        results[result][component, start:stop] = rows[operand] if isinstance(operand, int) else operand
+
+    return step
+
+
+def _bind(name: str, operands: list[Any], row: int) -> Step:
+    apply = _APPLY[name]
+    options = {} if name in _PLAIN else {"casting": "unsafe"}
+
+    def step(rows: list[Array], _arguments: Any, _results: list[Array], _start: int, _stop: int) -> None:
+        values = [rows[operand] if isinstance(operand, int) else operand for operand in operands]
+        apply(*values, out=rows[row], **options)
+
+    return step

@@ -1,0 +1,51 @@
+"""The contract of a kernel: one SX function on a batch, structure of arrays in and out."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.tape import Tape
+
+Array = NDArray[np.float64]
+
+
+class Kernel(ABC):
+    """A tape ready to run.
+
+    Attributes:
+        tape: The program.
+    """
+
+    def __init__(self, tape: Tape) -> None:
+        self.tape = tape
+
+    @abstractmethod
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate every lane.
+
+        Args:
+            arguments: One float64 array of shape (width, N) per input of the tape, rows contiguous.
+
+        Returns:
+            One new array of shape (width, N) per output. For a tape with a loop: the final state and the error of the state
+            before the last step, shape (1, N).
+
+        Raises:
+            ValueError: Shapes or types do not fit the tape.
+        """
+
+
+def check_arguments(tape: Tape, arguments: Sequence[Array]) -> int:
+    """Return the number of lanes N, or raise ValueError where arguments do not fit the tape."""
+    if len(arguments) != len(tape.inputs):
+        raise ValueError(f"kernel {tape.name}: needs {len(tape.inputs)} arguments, got {len(arguments)}")
+    n = arguments[0].shape[-1]
+    for index, (argument, width) in enumerate(zip(arguments, tape.inputs, strict=True)):
+        if argument.shape != (width, n) or argument.dtype != np.float64 or (n > 1 and argument.strides[1] != 8):
+            raise ValueError(
+                f"kernel {tape.name}: argument {index} must be float64 of shape ({width}, {n}) with contiguous rows,"
+                f" got {argument.dtype} of shape {argument.shape}"
+            )
+    return n

@@ -1,0 +1,174 @@
+"""Where kernels come from: SX builders, a cache of tapes and compiled libraries, and the backend that runs them."""
+
+import hashlib
+import inspect
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler
+from cnpgen.kernels.interpreted import InterpretedKernel
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.mapped import MappedKernel
+from cnpgen.kernels.tape import CODES, Loop, Tape, tape_from_function
+
+Backend = Literal["compiled", "numpy", "casadi"]
+BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
+
+
+@dataclass
+class KernelLibrary:
+    """Loads kernels for one robot and problem, building only what is not cached.
+
+    Attributes:
+        backend: "compiled", "numpy" (the tape interpreted) or "casadi" (its own map; slow, for reference).
+        cache_folder: Where tapes and libraries are kept.
+        identity: Digest of what builders read besides their parameters: problem and URDF.
+        arguments: Named objects handed to builders that ask for them by parameter name (robot, problem).
+    """
+
+    backend: Backend
+    cache_folder: Path
+    identity: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
+        """Return the kernel of the SX function that ``builder`` builds.
+
+        Args:
+            builder: A module-level function that returns a ``casadi.Function``. Parameters named like entries of
+                ``arguments`` are filled from there.
+            loop: How to iterate it, or None.
+            parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
+        """
+        wanted = inspect.signature(builder).parameters
+        given = {name: value for name, value in self.arguments.items() if name in wanted}
+        if self.backend == "casadi":
+            function = builder(**given, **parameters)
+            return MappedKernel(tape_from_function(function, loop), function)
+        tape = self._tape(builder, loop, given, parameters)
+        if self.backend == "numpy":
+            return InterpretedKernel(tape)
+        return CompiledKernel(tape, compile_tape(tape, self.cache_folder))
+
+    def _tape(self, builder: Callable[..., Any], loop: Loop | None, given: Mapping[str, Any], parameters: Mapping[str, Any]) -> Tape:
+        import importlib.metadata
+
+        identity = {
+            "builder": f"{builder.__module__}.{builder.__qualname__}",
+            "source": [_package_digest(), _source_digest(builder)],
+            "casadi": importlib.metadata.version("casadi"),
+            "problem": self.identity,
+            "loop": [loop.tolerance, loop.limit] if loop else None,
+            "parameters": parameters,
+        }
+        digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+        path = self.cache_folder / "tape" / f"{builder.__name__}-{digest[:24]}.npy"
+        try:
+            return Tape.from_bytes(path.read_bytes())
+        except (OSError, ValueError):
+            tape = tape_from_function(builder(**given, **parameters), loop)
+            _store(path, tape.to_bytes())
+            return tape
+
+
+def _store(path: Path, data: bytes) -> None:
+    """Write a cache entry atomically; a cache that cannot be written only costs time."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(data)
+        Path(file.name).replace(path)
+    except OSError:
+        return
+
+
+@cache
+def _package_digest() -> str:
+    """Digest of the package's own SX code: kernels are rebuilt when it changes."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for folder in ("robots", "kernels", "constraints", "pipelines"):
+        for path in sorted((root / folder).glob("*.py")):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _source_digest(builder: Callable[..., Any]) -> str:
+    source = inspect.getsourcefile(builder)
+    return hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+
+
+def default_cache_folder() -> Path:
+    """``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
+    if os.environ.get("CNPGEN_CACHE"):
+        return Path(os.environ["CNPGEN_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
+
+
+def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
+    """Decide which backend runs and where its cache is; warn once where it is not the fastest.
+
+    Args:
+        wanted: A backend, or None for the fastest that works on this machine.
+
+    Returns:
+        ``(backend, cache folder)``.
+
+    Raises:
+        UsageError: There is no such backend.
+        MachineError: The backend was asked for and does not work here.
+    """
+    if wanted is not None and wanted not in BACKENDS:
+        raise UsageError(f"backend {wanted!r} does not exist: expected one of {', '.join(BACKENDS)}")
+    folder = _writable(default_cache_folder())
+    if wanted in ("numpy", "casadi"):
+        return wanted, folder  # type: ignore[return-value]
+    try:
+        _try_compiler(folder)
+    except MachineError as error:
+        if wanted == "compiled":
+            raise
+        warnings.warn(f"{error}; running on the NumPy backend, about ten times slower", RuntimeWarning, stacklevel=2)
+        return "numpy", folder
+    return "compiled", folder
+
+
+def _writable(folder: Path) -> Path:
+    """Return the folder, or a fresh temporary one with a warning if it cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:
+        fallback = Path(tempfile.mkdtemp(prefix="cnpgen-cache-"))
+        warnings.warn(
+            f"cannot write the kernel cache {folder} ({error.strerror or error}); kernels are built again into {fallback}"
+            " (set CNPGEN_CACHE to a writable folder)",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return fallback
+
+
+def _try_compiler(folder: Path) -> None:
+    """Compile, load and run the smallest kernel; raise MachineError where that does not work."""
+    if find_compiler() is None:
+        raise MachineError("no C compiler found (looked for $CC, cc, gcc, clang)")
+    codes = np.array([CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]], np.int16)
+    operands = np.array([0, 0, 1], np.int32)
+    tape = Tape("selftest", (1,), (1,), codes, operands, np.zeros(3, np.int32), np.zeros(3))
+    kernel = CompiledKernel(tape, compile_tape(tape, folder))
+    (result,) = kernel(np.arange(5.0)[None])
+    if not np.array_equal(result[0], 2 * np.arange(5.0)):
+        raise MachineError("the C compiler makes wrong code: 2 x differs from x + x")
+

@@ -1,0 +1,140 @@
+"""A tape: an SX function as a flat list of scalar operations, and the description of the loop that runs it."""
+
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Operations that a tape may hold: name -> number of operands. Names follow CasADi's OP_* constants.
+OPERATIONS = {
+    "CONST": 0, "INPUT": 0, "OUTPUT": 1,
+    "ADD": 2, "SUB": 2, "MUL": 2, "DIV": 2, "NEG": 1, "SQ": 1, "TWICE": 1, "INV": 1, "SQRT": 1, "FABS": 1, "SIGN": 1,
+    "SIN": 1, "COS": 1, "EXP": 1, "FMIN": 2, "FMAX": 2,
+    "LT": 2, "LE": 2, "EQ": 2, "NE": 2, "NOT": 1, "AND": 2, "OR": 2, "IF_ELSE_ZERO": 2,
+}  # fmt: skip
+NAMES = tuple(OPERATIONS)
+CODES = {name: code for code, name in enumerate(NAMES)}
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Repeat the tape on each lane until its error is small: ``x, error = tape(x, parameters...)``.
+
+    The first input of the tape is the state, its first output the next state and its second output the error of the state that
+    it was given. A lane whose error is below ``tolerance`` takes that last step and is then frozen.
+
+    Attributes:
+        tolerance: A lane has converged when its error is below this.
+        limit: Largest number of steps.
+    """
+
+    tolerance: float
+    limit: int
+
+
+@dataclass(frozen=True)
+class Tape:
+    """A straight-line program on float64 scalars.
+
+    Instruction k computes value k. ``INPUT`` has a = argument, b = component; ``OUTPUT`` has a = value, b = argument and
+    ``constant`` = component; every other operation has a, b = operand values.
+
+    Attributes:
+        name: A C identifier.
+        inputs: Width of every argument.
+        outputs: Width of every result.
+        operation: Operation codes, shape (K,), int16.
+        a: First operands, shape (K,), int32.
+        b: Second operands, shape (K,), int32.
+        constant: Constants, shape (K,), float64.
+        loop: How to iterate, or None to evaluate once.
+    """
+
+    name: str
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+    operation: NDArray[np.int16]
+    a: NDArray[np.int32]
+    b: NDArray[np.int32]
+    constant: NDArray[np.float64]
+    loop: Loop | None = None
+
+    def __len__(self) -> int:
+        return len(self.operation)
+
+    def to_bytes(self) -> bytes:
+        """Serialize; equal tapes give equal bytes."""
+        buffer = io.BytesIO()
+        loop = [self.loop.tolerance, float(self.loop.limit)] if self.loop else []
+        header = [np.frombuffer(self.name.encode(), np.uint8), np.array(self.inputs), np.array(self.outputs), np.array(loop)]
+        for array in (*header, self.operation, self.a, self.b, self.constant):
+            np.save(buffer, array, allow_pickle=False)
+        return buffer.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> "Tape":
+        """Restore what ``to_bytes`` wrote.
+
+        Raises:
+            ValueError: The bytes are damaged.
+        """
+        buffer = io.BytesIO(data)
+        try:
+            name, inputs, outputs, loop, *program = (np.load(buffer, allow_pickle=False) for _ in range(8))
+        except (EOFError, OSError) as error:
+            raise ValueError(f"damaged tape: {error}") from error
+        iteration = Loop(float(loop[0]), int(loop[1])) if len(loop) else None
+        return cls(bytes(name).decode(), tuple(inputs.tolist()), tuple(outputs.tolist()), *program, iteration)
+
+
+def tape_from_function(function: Any, loop: Loop | None = None) -> Tape:
+    """Flatten a CasADi SX function.
+
+    Args:
+        function: A ``casadi.Function`` of SX expressions; arguments and results are columns.
+        loop: How to iterate it, or None.
+
+    Raises:
+        ValueError: It uses an operation that tapes do not have.
+    """
+    import casadi as ca
+
+    known = {getattr(ca, f"OP_{name}"): name for name in OPERATIONS}
+    count = function.n_instructions()
+    operation, a, b = np.zeros(count, np.int16), np.zeros(count, np.int32), np.zeros(count, np.int32)
+    constant = np.zeros(count)
+    holds: dict[int, int] = {}  # work vector slot -> value that it holds now
+    for k in range(count):
+        code, out, operands = function.instruction_id(k), function.instruction_output(k), function.instruction_input(k)
+        name = known.get(code)
+        if name is None:
+            raise ValueError(f"{function.name()}: operation {code} is not supported in kernels")
+        operation[k] = CODES[name]
+        if name == "CONST":
+            constant[k] = function.instruction_constant(k)
+        elif name == "INPUT":
+            a[k], b[k] = operands
+        elif name == "OUTPUT":
+            a[k], b[k], constant[k] = holds[operands[0]], out[0], out[1]
+        else:
+            a[k] = holds[operands[0]]
+            b[k] = holds[operands[1]] if OPERATIONS[name] == 2 else 0
+        if name != "OUTPUT":
+            holds[out[0]] = k
+    widths_in = tuple(function.nnz_in(i) for i in range(function.n_in()))
+    widths_out = tuple(function.nnz_out(i) for i in range(function.n_out()))
+    _check_dense(function)
+    return Tape(function.name(), widths_in, widths_out, operation, a, b, constant, loop)
+
+
+def _check_dense(function: Any) -> None:
+    """Raise for sparse arguments: their components could not be told apart by position."""
+    for count, nnz, numel, what in (
+        (function.n_in(), function.nnz_in, function.numel_in, "argument"),
+        (function.n_out(), function.nnz_out, function.numel_out, "result"),
+    ):
+        for index in range(count):
+            if nnz(index) != numel(index):
+                raise ValueError(f"{function.name()}: {what} {index} is sparse; densify it")

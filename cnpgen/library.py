@@ -1,0 +1,290 @@
+"""Find, list and load recipes: those that cnpgen ships by name, anybody's by path."""
+
+import hashlib
+import os
+import re
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from cnpgen import plugins
+from cnpgen.constraints.constraint import Constraint
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.pipelines.stage import Stage
+from cnpgen.recipes import DatasetRecipe, Pipeline, Problem
+from cnpgen.schema import Place, Reader, parse
+from cnpgen.units import show
+
+Kind = Literal["problem", "pipeline", "dataset"]
+Recipe = TypeVar("Recipe", Problem, Pipeline, DatasetRecipe)
+
+# Where the shipped files of a kind are, and the top-level keys that only files of that kind have.
+_LAYOUT: dict[Kind, str] = {
+    "problem": "problems/*/problem.toml",
+    "pipeline": "pipelines/*.toml",
+    "dataset": "datasets/*.toml",
+}
+_MARKS: dict[Kind, set[str]] = {"problem": {"robot"}, "pipeline": {"stage"}, "dataset": {"splits", "pipeline"}}
+
+
+def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
+    """Load a problem.
+
+    Args:
+        name_or_path: Name of a shipped problem, or path of a problem file.
+        relative_to: Folder that a path is relative to; by default the working directory.
+
+    Raises:
+        RecipeError: With every mistake in the file.
+    """
+    return _load(("problem",), name_or_path, relative_to, _problem)
+
+
+def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) -> Pipeline:
+    """Load a pipeline and its problem.
+
+    Args:
+        name_or_path: Name of a shipped pipeline, or path of a pipeline file.
+        relative_to: Folder that a path is relative to; by default the working directory.
+
+    Raises:
+        RecipeError: With every mistake in both files.
+    """
+    return _load(("pipeline",), name_or_path, relative_to, _pipeline)
+
+
+def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
+    """Load a dataset recipe, its pipeline and its problem.
+
+    A pipeline can be given as well: it becomes version 1.0.0 of a dataset of its name, 90 % training, 10 % validation.
+
+    Args:
+        name_or_path: Name of a shipped dataset or pipeline, or path of such a file.
+        relative_to: Folder that a path is relative to; by default the working directory.
+
+    Raises:
+        RecipeError: With every mistake in all three files.
+    """
+    return _load(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
+
+
+def list_recipes(kind: Kind) -> dict[str, Path]:
+    """List the shipped recipes of a kind: name -> file, by name."""
+    folder, _, pattern = _LAYOUT[kind].partition("/")
+    files = sorted((recipes_root() / folder).glob(pattern))
+    return {file.parent.name if kind == "problem" else file.stem: file for file in files}
+
+
+def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | None = None) -> Path:
+    """Find the file of a recipe.
+
+    Args:
+        kind: "problem", "pipeline" or "dataset".
+        name_or_path: A path if it ends in ``.toml``, has a path separator or is a file; else a shipped recipe's name.
+        relative_to: Folder that a path is relative to; by default the working directory.
+
+    Raises:
+        RecipeError: There is no such recipe.
+    """
+    try:
+        return _find((kind,), name_or_path, relative_to)
+    except ValueError as error:
+        raise RecipeError([str(error)]) from error
+
+
+def recipes_root() -> Path:
+    """Return the folder of the shipped recipes: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "_recipes"
+    return installed if installed.is_dir() else package.parent
+
+
+def _find(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None) -> Path:
+    """Find a recipe of one of several kinds, the first one first; a ValueError says why there is none."""
+    text = os.fspath(name_or_path)
+    path = (folder or Path()) / text
+    known = {name: file for kind in reversed(kinds) for name, file in list_recipes(kind).items()}
+    is_path = isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text or os.sep in text
+    if path.is_file():
+        return path
+    if is_path:
+        hint = nearest(Path(text).stem, known)
+        raise ValueError(
+            f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
+        )
+    if text not in known:
+        hint = nearest(text, known)
+        raise ValueError(f"unknown {kinds[0]} {text!r}{hint}; known: {', '.join(known) or 'none'}")
+    return known[text]
+
+
+def _load(
+    kinds: tuple[Kind, ...],
+    name_or_path: str | Path,
+    folder: Path | None,
+    build: Callable[[Path, list[str]], Recipe | None],
+) -> Recipe:
+    """Find, read and build a recipe, or raise all mistakes at once."""
+    try:
+        path = _find(kinds, name_or_path, folder)
+    except ValueError as error:
+        raise RecipeError([str(error)]) from error
+    mistakes: list[str] = []
+    recipe = build(path, mistakes)
+    if recipe is None or mistakes:
+        raise RecipeError(mistakes)
+    return recipe
+
+
+def _problem(path: Path, mistakes: list[str]) -> Problem | None:
+    read = _read(path, ("problem",), mistakes)
+    if read is None:
+        return None
+    data, table = read
+    where = Place(str(path))
+    readers: dict[type, Reader] = {Constraint: partial(_read_kind, plugins.CONSTRAINTS)}
+    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
+    before = len(mistakes)
+    mistakes.extend(_problem_mistakes(table, where, path.parent))
+    if problem is None or len(mistakes) > before:
+        return None
+    problem = replace(problem, path=path.absolute())
+    return replace(problem, digest=_digest(data, problem.urdf_path.read_bytes()))
+
+
+def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
+    read = _read(path, ("pipeline",), mistakes)
+    if read is None:
+        return None
+    data, table = read
+    readers: dict[type, Reader] = {
+        Stage: partial(_read_kind, plugins.STAGES),
+        Problem: _reference("problem", _problem, path.parent),
+    }
+    made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
+    return made and replace(made, path=path.absolute(), digest=_digest(data, made.problem.digest.encode()))
+
+
+def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
+    read = _read(path, ("dataset", "pipeline"), mistakes)
+    if read is None:
+        return None
+    data, table = read
+    if not _is("dataset", table) and _is("pipeline", table):
+        pipeline = _pipeline(path, mistakes)
+        return _wrapped(pipeline) if pipeline else None
+    readers: dict[type, Reader] = {Pipeline: _reference("pipeline", _pipeline, path.parent)}
+    made = parse(DatasetRecipe, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
+    return made and replace(made, path=path.absolute(), digest=_digest(data, made.pipeline.digest.encode()))
+
+
+def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
+    """Make a dataset of a pipeline alone."""
+    return DatasetRecipe(
+        name=pipeline.name,
+        title=pipeline.title,
+        pipeline=pipeline,
+        splits={"train": 90, "validation": 10},
+        path=pipeline.path,
+        digest=_digest(b"", pipeline.digest.encode()),
+    )
+
+
+def _read(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> tuple[bytes, dict[str, Any]] | None:
+    """Return the bytes of a recipe file and its top-level table, or None after a mistake."""
+    try:
+        data = path.read_bytes()
+        return data, _expect(kinds, _toml(data))
+    except OSError as error:
+        mistakes.append(f"{path}: cannot be read: {error.strerror}")
+    except ValueError as error:
+        mistakes.append(f"{path}: {error}")
+    return None
+
+
+def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
+    """Return the table unless it is clearly a recipe of another kind."""
+    found = [kind for kind in _MARKS if _is(kind, table)]
+    if found and not set(found) & set(kinds):
+        raise ValueError(f"is a {found[0]}, expected a {kinds[0]}")
+    return table
+
+
+def _toml(data: bytes) -> dict[str, Any]:
+    """Parse TOML; a ValueError says in which line it is wrong."""
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ValueError(f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}") from error
+    except (ValueError, RecursionError) as error:
+        found = re.search(r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error))
+        line = int(found[1]) if found and found[1] else len(data.splitlines())
+        text = str(error).replace(found[0], "") if found else str(error)
+        raise ValueError(f"line {line}: not valid TOML: {text}") from error
+
+
+def _is(kind: Kind, table: dict[str, Any]) -> bool:
+    """Whether a top-level table has a key that only recipes of this kind have."""
+    return not _MARKS[kind].isdisjoint(table)
+
+
+def _reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
+    """Return what reads a key that names another recipe."""
+
+    def read(value: Any, where: Place, mistakes: list[str]) -> Any:
+        if isinstance(value, str):
+            return build(_find((kind,), value, folder), mistakes)
+        mistakes.append(where.says(f"expected a name or a path, got {show(value)}"))
+        return None
+
+    return read
+
+
+def _read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any:
+    """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
+    use = value.get("use") if isinstance(value, dict) else None
+    if not isinstance(use, str):
+        mistakes.append((where / "use").says(f"missing key, expected one of {', '.join(plugins.names(group))}"))
+        return None
+    try:
+        kind = plugins.load(group, use)
+    except RecipeError as error:
+        mistakes.extend((where / "use").says(text) for text in error.mistakes)
+        return None
+    rest = {key: entry for key, entry in value.items() if key != "use"}
+    return parse(kind, rest, where=where, mistakes=mistakes)
+
+
+def _problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
+    """Check what is about several tables; on the raw ones, so that it is reported along with their own mistakes."""
+    robot = table.get("robot")
+    urdf = robot.get("urdf") if isinstance(robot, dict) else None
+    if isinstance(urdf, str) and not (folder / urdf).is_file():
+        hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
+        yield (where / "robot" / "urdf").says(f"no such file: {folder / urdf}{hint}")
+    yield from _repeated(table, where, "constraint", "use")
+    yield from _repeated(table, where, "obstacle", "name")
+    for index, obstacle in _tables(table, "obstacle"):
+        if obstacle.get("below") and "object" not in table:
+            yield (where / "obstacle" / index / "below").says("nothing stands on the obstacle: there is no [object]")
+
+
+def _repeated(table: dict[str, Any], where: Place, array: str, key: str) -> Iterator[str]:
+    seen: list[Any] = []
+    for index, entry in _tables(table, array):
+        if key in entry and entry[key] in seen:
+            yield (where / array / index / key).says(f"there is a {array} {show(entry[key])} already")
+        seen.append(entry.get(key))
+
+
+def _tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:
+    entries = table.get(array)
+    return [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)] if isinstance(entries, list) else []
+
+
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()

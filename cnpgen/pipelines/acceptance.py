@@ -1,0 +1,127 @@
+"""The last gate of every pipeline: the problem's own constraints, evaluated on the numbers as they will be stored.
+
+It shares no assumption with the stages before it: nothing about convergence, order or exactness is taken for granted.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.constraints.constraint import EXACTNESS, End
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.obstacles import obstacle_tops
+from cnpgen.pipelines.stage import Array, Batch, Run
+from cnpgen.recipes import Problem
+from cnpgen.robots.linalg import Scalar, dot, subtract
+from cnpgen.robots.symbolic import SymbolicState, symbols
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+
+def acceptance(context: Context, written: set[str]) -> Run:
+    """Prepare the gate.
+
+    Args:
+        context: The surroundings.
+        written: Columns that the stages write; accelerations and torques of the goal are checked if its acceleration is known.
+
+    Returns:
+        A function that rejects, under each constraint's reason, what is not exactly a boundary problem.
+    """
+    ends: tuple[End, ...] = ("start", "goal")
+    kernels = {
+        end: context.kernels.load(boundary_excess, end=end, needs=2 if f"{end}_ddq" in written else 1, dtype=context.dtype)
+        for end in ends
+    }
+    hitting = context.kernels.load(direction_excess, dtype=context.dtype) if "hit_angle" in written else None
+    reasons = [constraint.reason for constraint in context.problem.constraint]
+    n = context.robot.n
+
+    def run(batch: Batch, _random: np.random.Generator) -> None:
+        tops = obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
+        excess = []
+        for end in ends:
+            acceleration = batch.columns.get(f"{end}_ddq")
+            if acceleration is None:
+                acceleration = np.zeros((n, len(batch.alive)))
+            (worst,) = kernels[end](batch[f"{end}_q"], batch[f"{end}_dq"], acceleration, tops, batch[f"{end}_xyz"])
+            excess.append(worst)
+        met = np.maximum(*excess) <= 0
+        gates = list(zip([*reasons, "tip not at its position"], met, strict=True))
+        if hitting is not None:
+            (worst,) = hitting(batch["goal_q"], batch["goal_dq"], batch["hit_angle"], batch["hit_speed"])
+            gates.append(("hit not along its direction", worst[0] <= 0))
+        alive = batch.alive
+        for reason, ok in gates:
+            batch.reject(ok[np.searchsorted(alive, batch.alive)], reason)
+
+    return run
+
+
+def boundary_excess(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str) -> Any:
+    """Build ``(q, dq, ddq, tops, position) -> excess``, positive where a boundary state is not exact.
+
+    Args:
+        robot: The robot.
+        problem: The problem.
+        end: Which end of the motion.
+        needs: The highest derivative of q that is known there; conditions on higher ones are left out.
+        dtype: How exactly (see ``EXACTNESS``).
+
+    Returns:
+        A function whose result has one row per constraint, in order, and one for the position of the tip.
+    """
+    import casadi as ca
+
+    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", len(problem.obstacle)), ("p", 3))
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops), (p_sx, p) = (symbols(name, width) for name, width in names)
+    size = problem.object.size if problem.object is not None else None
+    state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
+    rows: list[Scalar] = []
+    for constraint in problem.constraint:
+        worst: Scalar = ca.SX(-1)
+        for condition in constraint.symbolic_at(state, end):
+            if condition.needs <= needs:
+                worst = _worst(worst, condition.g, condition.lower, condition.upper, condition.slack(dtype))
+        rows.append(worst)
+    miss = subtract(p, state.kinematics.tip)
+    rows.append(ca.sqrt(dot(miss, miss)) - EXACTNESS[dtype]["position"])
+    # nan compares as not met on the other side
+    return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, tops_sx, p_sx], [ca.vertcat(*rows)])
+
+
+def _worst(worst: Scalar, g: list[Scalar], lower: Array, upper: Array, slack: Array) -> Scalar:
+    import casadi as ca
+
+    for value, low, high, room in zip(g, lower, upper, slack, strict=True):
+        if np.isfinite(low):
+            worst = ca.fmax(worst, float(low - room) - value)
+        if np.isfinite(high):
+            worst = ca.fmax(worst, value - float(high + room))
+    return worst
+
+
+def direction_excess(robot: "Robot", *, dtype: str) -> Any:
+    """Build ``(q, dq, angle, speed) -> excess``: the tip must move along the angle, horizontally, at that speed."""
+    import casadi as ca
+
+    names = (("q", robot.n), ("dq", robot.n), ("angle", 1), ("speed", 1))
+    (q_sx, q), (dq_sx, dq), (angle_sx, angle), (speed_sx, speed) = (symbols(name, width) for name, width in names)
+    zero = [0.0] * robot.n
+    velocity = SymbolicState(robot, q, dq, zero, [], (), None).tip_velocity
+    cosine, sine = ca.cos(angle[0]), ca.sin(angle[0])
+    across = ca.fabs(cosine * velocity[1] - sine * velocity[0])
+    along = cosine * velocity[0] + sine * velocity[1] - speed[0]
+    exact = EXACTNESS[dtype]
+    excess = ca.fmax(across - exact["velocity"], ca.fabs(along) - exact["velocity"])
+    return ca.Function("direction", [q_sx, dq_sx, angle_sx, speed_sx], [excess])
+
+
+def bookkeeping_fields() -> tuple[Field, ...]:
+    """The fields that every dataset has."""
+    return (
+        Field("attempts", "1", "draws that it took to find this row, itself included", role="diagnostic", dtype="int64"),
+        Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
+    )

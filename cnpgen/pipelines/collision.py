@@ -1,0 +1,155 @@
+"""Stage: collisions of the arm and the held object with the boxes of the world, judged by Coal on both ends.
+
+An exact test of every capsule's segment against every box comes first and rejects almost all collisions cheaply; Coal then judges
+every sample that is left. The boxes move with the sample, so each becomes a sliding joint of the Pinocchio model: one call checks a
+whole batch without any Python per sample.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.obstacles import obstacle_tops
+from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.recipes import Problem
+from cnpgen.robots.boxes import segment_box_distance
+from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.schema import field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+DEEP = 10.0  # m: height of the box that stands for an obstacle without a lower end
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collision(Stage):
+    """Rejects configurations where the arm or the object enters an obstacle."""
+
+    end: str = field("which end", choices=("start", "goal", "both"))
+    judge: str = field("what decides: the exact segment test alone, or Coal after it", choices=("segments", "coal"))
+
+    @property
+    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Configurations, and the positions that the obstacles stand below."""
+        return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
+
+    def describe(self) -> str:
+        """Say who judges what."""
+        ends = "both ends" if self.end == "both" else f"the {self.end} configuration"
+        how = "by an exact segment-to-box test" if self.judge == "segments" else "judged by Coal on arm and object"
+        return f"require {ends} to be free of collision, {how}"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The clearance, where the segment test computes it."""
+        del context
+        if self.judge == "coal":
+            return ()
+        text = "distance of the arm's skeleton from the nearest obstacle at the {}, less the capsules' radius"
+        return tuple(Field(f"{end}_clearance", "m", text.format(end), role="diagnostic") for end in self._ends())
+
+    def prepare(self, context: Context) -> Run:
+        """Load the kernel or build the geometry."""
+        radius = context.constraint(RobotClearance, "collision").radius
+        return self._by_coal(context, radius) if self.judge == "coal" else self._by_segments(context, radius)
+
+    def _ends(self) -> tuple[str, ...]:
+        return ("start", "goal") if self.end == "both" else (self.end,)
+
+    def _by_segments(self, context: Context, radius: float) -> Run:
+        kernel = context.kernels.load(skeleton_distance)
+
+        def run(batch: Batch, _random: np.random.Generator) -> None:
+            for end in self._ends():
+                (distance,) = kernel(batch[f"{end}_q"], obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"]))
+                batch[f"{end}_clearance"] = distance - radius
+                batch.reject(distance[0] > radius, f"arm in collision at the {end}")
+
+        return run
+
+    def _by_coal(self, context: Context, radius: float) -> Run:
+        depth = context.constraint(ObjectContact, "collision").depth
+        judge = coal_judge(context.problem, context.robot, radius, depth)
+
+        def run(batch: Batch, _random: np.random.Generator) -> None:
+            tops = obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
+            hit = judge(np.concatenate([batch[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends())))
+            batch.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
+
+        return run
+
+
+def skeleton_distance(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, tops) -> smallest distance of a segment of the skeleton from an obstacle`` [m]."""
+    import casadi as ca
+
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    zero = [0.0] * robot.n
+    state = SymbolicState(robot, q, zero, zero, tops, problem.obstacle, None)
+    nearest = ca.SX(np.inf)
+    for first, second in state.segments:
+        for box in state.boxes:
+            nearest = ca.fmin(nearest, segment_box_distance(first, second, box))
+    return ca.Function("skeleton_distance", [q_sx, tops_sx], [nearest])
+
+
+def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) -> Any:
+    """Return a function ``(q (n, N), tops (obstacles, N)) -> collides (N,)`` that asks Coal.
+
+    The held object is made smaller by ``depth`` on every side: the contact that is legal does not count, and the touching pair,
+    the slowest case of Coal's algorithms, becomes a clear one.
+    """
+    import coal
+    import pinocchio as pin
+
+    model = robot.model.copy()
+    geometry = pin.GeometryModel()
+    moving = _add_capsules(geometry, robot, radius)
+    if problem.object is not None:
+        size = np.array(problem.object.size) - 2 * depth
+        frame = model.frames[model.getFrameId(robot.tip)]
+        box = pin.GeometryObject("object", frame.parentJoint, 0, frame.placement, coal.Box(*size))
+        moving.append(geometry.addGeometryObject(box))
+    for index, obstacle in enumerate(problem.obstacle):
+        height = DEEP if obstacle.height is None else obstacle.height
+        centre = np.array([(obstacle.x.low + obstacle.x.high) / 2, (obstacle.y.low + obstacle.y.high) / 2, 0.0])
+        slide = model.addJoint(0, pin.JointModelPZ(), pin.SE3(np.eye(3), centre), f"obstacle_{index}")
+        shape = coal.Box(obstacle.x.high - obstacle.x.low, obstacle.y.high - obstacle.y.low, height)
+        below = pin.SE3(np.eye(3), np.array([0.0, 0.0, -height / 2]))
+        added = geometry.addGeometryObject(pin.GeometryObject(obstacle.name, slide, 0, below, shape))
+        for body in moving:
+            geometry.addCollisionPair(pin.CollisionPair(body, added))
+    pool = pin.GeometryPool(model, geometry, 1)
+
+    def judge(q: Array, tops: Array) -> NDArray[np.bool_]:
+        states = np.asfortranarray(np.concatenate([q, tops]))
+        return np.asarray(pin.computeCollisionsInParallel(1, pool, states, True)).astype(bool)
+
+    return judge
+
+
+def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
+    """Add one capsule per segment of the skeleton, attached to the joint that moves it."""
+    import coal
+    import pinocchio as pin
+
+    model = robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    origins = [data.oMi[i].translation.copy() for i in range(1, model.njoints)]
+    origins.append(data.oMf[model.getFrameId(robot.tip)].translation.copy())
+    added = []
+    for a, b in robot.skeleton:
+        joint = a + 1  # the segment from origin a on turns with joint a
+        first, second = data.oMi[joint].actInv(origins[a]), data.oMi[joint].actInv(origins[b])
+        length = float(np.linalg.norm(second - first))
+        turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (second - first) / length).toRotationMatrix()
+        placement = pin.SE3(turn, (first + second) / 2)
+        capsule = pin.GeometryObject(f"capsule_{a}_{b}", joint, 0, placement, coal.Capsule(radius, length))
+        added.append(geometry.addGeometryObject(capsule))
+    return added

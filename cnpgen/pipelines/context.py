@@ -1,0 +1,52 @@
+"""What a stage is prepared with: the problem, its robot and the kernels."""
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+from cnpgen.constraints.constraint import Constraint
+from cnpgen.errors import RecipeError
+from cnpgen.fields import Field
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.recipes import Problem
+from cnpgen.robots.robot import Robot
+
+Kind = TypeVar("Kind", bound=Constraint)
+
+
+@dataclass(frozen=True)
+class Context:
+    """The surroundings of a stage.
+
+    Attributes:
+        problem: What a valid motion is.
+        robot: The robot with its planning limits.
+        kernels: Where kernels are loaded from.
+        dtype: The float type that rows are stored in.
+    """
+
+    problem: Problem
+    robot: Robot
+    kernels: KernelLibrary
+    dtype: str = "float64"
+
+    def constraint(self, kind: type[Kind], stage: str) -> Kind:
+        """Return the problem's constraint of a kind.
+
+        Raises:
+            RecipeError: The problem has none, so that ``stage`` has no meaning in it.
+        """
+        for constraint in self.problem.constraint:
+            if isinstance(constraint, kind):
+                return constraint
+        raise RecipeError([f"{self.problem.path}: stage {stage!r} needs a constraint {kind.__name__!r}, the problem has none"])
+
+    def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:
+        """Describe a field with one column per planned joint, bounded by the planning limits of its unit."""
+        robot = self.robot
+        bounds = {
+            "rad": (robot.position_lower, robot.position_upper),
+            "rad/s": (-robot.velocity_limit, robot.velocity_limit),
+            "rad/s^2": (-robot.acceleration_limit, robot.acceleration_limit),
+        }[unit]
+        low, high = (tuple(float(x) for x in bound) for bound in bounds)
+        return Field(name, unit, long_name, robot.n, robot.joint_names, role, valid_min=low, valid_max=high)

@@ -1,0 +1,83 @@
+"""Stage: draw the start and goal position of the tip."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cnpgen.errors import RecipeError
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.schema import Range, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawPositions(Stage):
+    """Start and goal position uniform in two boxes, at least ``min_distance`` apart."""
+
+    start: tuple[Range, ...] = field("box of start positions: x, y, z", unit="m")
+    goal: tuple[Range, ...] = field("box of goal positions: x, y, z", unit="m")
+    min_distance: float = field("smallest horizontal distance between the two", unit="m", default=0.0, low=0.0)
+
+    def describe(self) -> str:
+        """Say what is drawn."""
+        text = f"draw a start position in {_box(self.start)} m and a goal position in {_box(self.goal)} m"
+        return f"{text}, at least {self.min_distance:g} m apart" if self.min_distance else text
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """Both positions."""
+        del context
+        return tuple(
+            Field(
+                f"{end}_xyz",
+                "m",
+                f"{end} position of the tip",
+                3,
+                ("x", "y", "z"),
+                "context",
+                "world",
+                tuple(axis.low for axis in box),
+                tuple(axis.high for axis in box),
+            )
+            for end, box in (("start", self.start), ("goal", self.goal))
+        )
+
+    def prepare(self, context: Context) -> Run:
+        """Check that the boxes can be reached and return the draw."""
+        self._check_reach(context)
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            batch["start_xyz"] = uniform(batch.draw(random, 3), self.start)
+            batch["goal_xyz"] = uniform(batch.draw(random, 3), self.goal)
+            apart = np.hypot(*(batch["goal_xyz"] - batch["start_xyz"])[:2])
+            batch.reject(apart >= self.min_distance, "too close together")
+
+        return run
+
+    def _check_reach(self, context: Context) -> None:
+        mistakes = []
+        shoulder = context.robot.chain.joints[0].translation
+        for end, box in (("start", self.start), ("goal", self.goal)):
+            if len(box) != 3:
+                mistakes.append(f"draw-positions: {end}: needs three ranges (x, y, z), got {len(box)}")
+                continue
+            nearest = np.clip(shoulder, [axis.low for axis in box], [axis.high for axis in box])
+            distance = float(np.linalg.norm(nearest - shoulder))
+            if distance > context.robot.chain.reach:
+                mistakes.append(
+                    f"draw-positions: {end}: the whole box {_box(box)} m is out of reach:"
+                    f" {distance:.2f} m from the first joint, the arm is {context.robot.chain.reach:.2f} m long"
+                )
+        if mistakes:
+            raise RecipeError(mistakes)
+
+
+def uniform(numbers: Array, ranges: tuple[Range, ...]) -> Array:
+    """Scale uniform numbers of shape (m, n) to m ranges."""
+    low = np.array([[r.low] for r in ranges])
+    high = np.array([[r.high] for r in ranges])
+    return low + (high - low) * numbers
+
+
+def _box(ranges: tuple[Range, ...]) -> str:
+    return " x ".join(f"[{r.low:g}, {r.high:g}]" if r.low < r.high else f"{{{r.low:g}}}" for r in ranges)

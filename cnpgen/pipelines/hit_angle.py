@@ -1,0 +1,81 @@
+"""Stages: draw the direction of the hit in the table plane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.schema import field
+
+
+def _angle_field() -> Field:
+    low, high = (-float(np.pi),), (float(np.pi),)
+    return Field("hit_angle", "rad", "direction of the hit about world z, from world x", role="context", frame="world",
+                 valid_min=low, valid_max=high)  # fmt: skip
+
+
+def wrap(angle: Array) -> Array:
+    """Map angles to [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitAngleToGoal(Stage):
+    """Towards a point behind the goal position, with uniform noise."""
+
+    needs = ("goal_xyz",)
+    target: tuple[float, ...] = field("where the puck is sent: x, y", unit="m")
+    noise: float = field("largest deviation to either side", unit="rad", default=0.0, low=0.0, high=np.pi)
+
+    def describe(self) -> str:
+        """Say where to."""
+        return f"aim from the goal position at ({self.target[0]:g}, {self.target[1]:g}) m, plus uniform noise of +-{self.noise:g} rad"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The angle."""
+        del context
+        return (_angle_field(),)
+
+    def prepare(self, context: Context) -> Run:
+        """Nothing to load."""
+        del context
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            x, y = batch["goal_xyz"][:2]
+            noise = self.noise * (2 * batch.draw(random, 1) - 1)
+            batch["hit_angle"] = wrap(np.arctan2(self.target[1] - y, self.target[0] - x) + noise)
+
+        return run
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitAngleInCone(Stage):
+    """Uniform in a cone about the line from start to goal.
+
+    The same law as drawing all directions and rejecting those outside the cone, without the rejections.
+    """
+
+    needs = ("start_xyz", "goal_xyz")
+    half_angle: float = field("half the opening of the cone", unit="rad", low=0.0, high=np.pi)
+
+    def describe(self) -> str:
+        """Say how wide."""
+        return f"draw the hit direction uniformly within {self.half_angle:.4g} rad of the line from start to goal"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The angle."""
+        del context
+        return (_angle_field(),)
+
+    def prepare(self, context: Context) -> Run:
+        """Nothing to load."""
+        del context
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            x, y = (batch["goal_xyz"] - batch["start_xyz"])[:2]
+            noise = self.half_angle * (2 * batch.draw(random, 1) - 1)
+            batch["hit_angle"] = wrap(np.arctan2(y, x) + noise)
+
+        return run

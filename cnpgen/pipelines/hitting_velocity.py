@@ -1,0 +1,156 @@
+"""Stage: the fastest joint velocity along the hit, a linear programme solved exactly.
+
+Maximise ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the tip's velocity along the hit and ``b_i`` its
+two components across it per unit of joint i. The dual, ``min over y in R^2 of sum_i L_i |a_i - b_i . y|``, has its minimum where two
+residuals vanish: n (n - 1) / 2 candidates, evaluated without branches. Joints with non-zero residual go to the limit of its sign.
+
+In half of the poses of an arm with intersecting axes three or more residuals vanish together and the optimum is a face. The
+joints left are then given the velocity ``v_i = t L_i sign(b_i . z)`` of smallest t that closes the equations: again a linear
+programme, whose dual has its optimum at a ``z`` orthogonal to one of the b_i.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stage import Batch, Run, Stage
+from cnpgen.robots.linalg import Scalar, dot
+from cnpgen.robots.symbolic import Vec, forward_kinematics, symbols
+from cnpgen.schema import field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+VANISHING = 1e-11  # m: a residual below this is zero
+PARALLEL = 1e-9  # relative size of a determinant that is taken for zero
+
+
+@dataclass(frozen=True, kw_only=True)
+class HittingVelocity(Stage):
+    """Joint velocities of the goal: along the hit exactly, as fast as possible or scaled down."""
+
+    needs = ("goal_q", "hit_angle")
+    full_speed: float = field("fraction of the hits at the highest possible speed; the others are scaled", low=0.0, high=1.0)
+    min_speed: float = field("hits that cannot be faster than this are rejected", unit="m/s", default=1e-3, low=1e-9)
+
+    def describe(self) -> str:
+        """Say how fast."""
+        slower = f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
+        return f"solve the linear programme for the fastest joint velocity along the hit{slower}"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The joint velocity and the speeds."""
+        return (
+            context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
+            Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
+            Field("hit_speed_max", "m/s", "highest possible speed along the hit at the goal configuration", role="diagnostic", frame="world"),
+        )
+
+    def prepare(self, context: Context) -> Run:
+        """Load the kernel."""
+        kernel = context.kernels.load(hitting_velocity)
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
+            velocity, speed = kernel(batch["goal_q"], direction)
+            factor, choice = batch.draw(random, 1), batch.draw(random, 1)
+            factor = np.where(choice < self.full_speed, 1.0, factor)
+            batch["goal_dq"], batch["hit_speed"], batch["hit_speed_max"] = velocity * factor, speed * factor, speed
+            batch.reject(np.isfinite(velocity).all(0) & (speed[0] >= self.min_speed), "no hitting velocity")
+
+        return run
+
+
+def hitting_velocity(robot: "Robot") -> Any:
+    """Build the linear programme as an SX function ``(q, d) -> (dq, speed)``.
+
+    Args:
+        robot: The robot.
+
+    Returns:
+        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximises the tip's speed [m/s] along d.
+    """
+    import casadi as ca
+
+    (q_sx, q), (d_sx, d) = symbols("q", robot.n), symbols("d", 2)
+    jacobian = forward_kinematics(robot.chain, q).jacobian
+    along = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
+    across = [[d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian]
+    velocity, speed = maximise(along, across, [float(x) for x in robot.velocity_limit])
+    return ca.Function("hitting_velocity", [q_sx, d_sx], [ca.vertcat(*velocity), speed])
+
+
+def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
+    """Solve ``max a . v, sum_i b_i v_i = 0, |v_i| <= limit_i`` without branches; n >= 2, b_i in R^2.
+
+    Returns:
+        ``(v, value)`` as SX scalars.
+    """
+    import casadi as ca
+
+    n = len(a)
+    best: Scalar = ca.SX(np.inf)
+    y: Vec = [ca.SX(0), ca.SX(0)]
+    for i, j in combinations(range(n), 2):
+        det = _det(b[i], b[j])
+        size = ca.fabs(b[i][0] * b[j][1]) + ca.fabs(b[i][1] * b[j][0])
+        usable = ca.fabs(det) > PARALLEL * size
+        inverse = 1.0 / ca.if_else(usable, det, 1.0)
+        candidate = [(a[i] * b[j][1] - b[i][1] * a[j]) * inverse, (b[i][0] * a[j] - a[i] * b[j][0]) * inverse]
+        value: Scalar = 0.0
+        for k in range(n):
+            if k not in (i, j):
+                value = value + limit[k] * ca.fabs(a[k] - dot(b[k], candidate))
+        better = ca.logic_and(usable, value < best)
+        best = ca.if_else(better, value, best)
+        y = [ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)]
+    residual = [a[k] - dot(b[k], y) for k in range(n)]
+    left = [ca.fabs(r) < VANISHING for r in residual]
+    fixed = [ca.if_else(free, 0.0, bound * ca.sign(r)) for free, bound, r in zip(left, limit, residual, strict=True)]
+    missing = [-dot([b[k][c] for k in range(n)], fixed) for c in range(2)]
+    rest = _smallest_ratio([[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)], limit, missing)
+    return [x + r for x, r in zip(fixed, rest, strict=True)], best
+
+
+def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
+    """Solve ``min t, sum_i b_i v_i = target, |v_i| <= t limit_i``; joints with b_i = 0 stay at rest."""
+    import casadi as ca
+
+    n = len(b)
+    ratio: Scalar = ca.SX(-1)
+    z: Vec = [ca.SX(0), ca.SX(0)]
+    pivot: Vec = [ca.SX(0), ca.SX(0)]
+    for j in range(n):
+        normal = [-b[j][1], b[j][0]]
+        weight: Scalar = 0.0
+        for k in range(n):
+            if k != j:
+                weight = weight + limit[k] * ca.fabs(dot(b[k], normal))
+        size = dot(normal, normal)
+        usable = weight > PARALLEL * ca.sqrt(size) * 1e-3
+        value = dot(target, normal) / ca.if_else(usable, weight, 1.0)
+        better = ca.logic_and(usable, ca.fabs(value) > ratio)
+        ratio = ca.if_else(better, ca.fabs(value), ratio)
+        sign = ca.if_else(value < 0, -1.0, 1.0)
+        z = [ca.if_else(better, sign * new, old) for new, old in zip(normal, z, strict=True)]
+        pivot = [ca.if_else(better, new, old) for new, old in zip(b[j], pivot, strict=True)]
+    ratio = ca.fmax(ratio, 0.0)
+    length = ca.sqrt(dot(pivot, pivot))
+    parallel = [ca.fabs(dot(x, z)) <= PARALLEL * length * ca.sqrt(dot(x, x)) for x in b]
+    v = [ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z))) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
+    shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    total: Scalar = 0.0
+    for share in shares:
+        total = total + ca.fabs(share)
+    amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
+    along = [ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    return [x + w for x, w in zip(v, along, strict=True)]
+
+
+def _det(a: Vec, b: Vec) -> Scalar:
+    return a[0] * b[1] - a[1] * b[0]

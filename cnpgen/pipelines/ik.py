@@ -1,0 +1,165 @@
+"""Stages: inverse kinematics of the start and of the goal, position alone or position and vertical orientation."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.errors import RecipeError
+from cnpgen.fields import Field
+from cnpgen.kernels.tape import Loop
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.draw import uniform
+from cnpgen.pipelines.stage import Batch, Run, Stage
+from cnpgen.robots.linalg import Scalar, add, dot, gram, scale, solve, subtract
+from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
+from cnpgen.schema import Range, field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+TOLERANCE = 1e-7  # m and rad, before the last (quadratically convergent) step
+MAX_STEPS = 24
+DAMPING = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class _IK(Stage):
+    """Gauss-Newton with clipped steps that saturate at the joint limits."""
+
+    orientation: str = field("what the tip's orientation must be", choices=("free", "vertical"), default="free")
+    max_step: float = field("largest change of a joint in one iteration", unit="rad", default=0.4, low=1e-3)
+
+    def _solve(self, context: Context, end: str, initial: str) -> Run:
+        kernel = context.kernels.load(
+            ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=self.orientation == "vertical", max_step=self.max_step
+        )
+        low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
+
+        def run(batch: Batch, _random: np.random.Generator) -> None:
+            q, error = kernel(batch[initial], batch[f"{end}_xyz"])
+            batch[f"{end}_q"] = q
+            batch.reject(error[0] < TOLERANCE, f"no inverse kinematics of the {end}")
+            q = batch[f"{end}_q"]
+            batch.reject(((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}")
+
+        return run
+
+    def _how(self) -> str:
+        return " with the tip's z axis vertical" if self.orientation == "vertical" else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartIK(_IK):
+    """Joint positions of the start, from the base configuration or from a random guess."""
+
+    needs = ("start_xyz",)
+    guess: tuple[Range, ...] = field("box of random guesses; none: the base configuration", unit="rad", default=())
+
+    def describe(self) -> str:
+        """Say from where."""
+        origin = "a random guess in " + " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess) + " rad"
+        return f"solve the start configuration{self._how()} from {origin if self.guess else 'the base configuration'}"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The start configuration."""
+        return (context.joint_field("start_q", "rad", "joint positions at the start"),)
+
+    def prepare(self, context: Context) -> Run:
+        """Load the kernel."""
+        n = context.robot.n
+        if self.guess and len(self.guess) != n:
+            raise RecipeError([f"start-ik: guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
+        guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
+        solve_start = self._solve(context, "start", "guess_q")
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            batch["guess_q"] = uniform(batch.draw(random, n), guess)
+            solve_start(batch, random)
+
+        return run
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalIK(_IK):
+    """Joint positions of the goal, from the start configuration."""
+
+    needs = ("goal_xyz", "start_q")
+
+    def describe(self) -> str:
+        """Say from where."""
+        return f"solve the goal configuration{self._how()} from the start configuration"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The goal configuration."""
+        return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
+
+    def prepare(self, context: Context) -> Run:
+        """Load the kernel."""
+        return self._solve(context, "goal", "start_q")
+
+
+def ik_step(robot: "Robot", *, vertical: bool, max_step: float) -> Any:
+    """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
+
+    A joint that the step would carry beyond its limit is put on the limit and the rest of the step is redistributed over the
+    others, once.
+
+    Args:
+        robot: The robot.
+        vertical: Whether the tip's z axis must be vertical, too.
+        max_step: Largest change of a joint [rad].
+    """
+    import casadi as ca
+
+    (q_sx, q), (p_sx, p) = symbols("q", robot.n), symbols("p", 3)
+    kin = forward_kinematics(robot.chain, q)
+    rows = [[column[row] for column in kin.jacobian] for row in range(3)]
+    error = subtract(p, kin.tip)
+    if vertical:
+        tilt, tilt_rows = _tilt(kin)
+        error, rows = [*error, *tilt], [*rows, *tilt_rows]
+    step = _clipped(rows, error, max_step)
+    target, factor = add(q, step[0]), step[1]
+    free = [
+        ca.logic_and(float(low) <= x, x <= float(high))
+        for x, low, high in zip(target, robot.position_lower, robot.position_upper, strict=True)
+    ]
+    moved = [ca.if_else(ok, 0.0, _clip(x, robot, i) - q[i]) for i, (ok, x) in enumerate(zip(free, target, strict=True))]
+    rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
+    again, _ = _clipped([[x * ok for x, ok in zip(row, free, strict=True)] for row in rows], rest, max_step)
+    following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
+    return ca.Function("ik", [q_sx, p_sx], [ca.vertcat(*following), ca.sqrt(dot(error, error))])
+
+
+def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
+    """Angular error of the tip's z axis about world x and y, and its Jacobian rows.
+
+    ``z x e_z`` scaled by ``2 / (1 + z_z) = 2 tan(angle / 2) / sin(angle)``, so that upside down is no fixed point.
+    """
+    import casadi as ca
+
+    up = [row[2] for row in kin.rotation]
+    stretch = 2.0 / ca.fmax(1.0 + up[2], 1e-3)
+    rows = [[axis[row] if turns else 0.0 for axis, turns in zip(kin.axes, kin.turning, strict=True)] for row in range(2)]
+    return [up[1] * stretch, -up[0] * stretch], rows
+
+
+def _clipped(rows: list[Vec], error: Vec, max_step: float) -> tuple[Vec, Scalar]:
+    """Least-norm step that closes the error, shortened to ``max_step``; returns it and the factor of shortening."""
+    import casadi as ca
+
+    weights = solve(gram(rows, DAMPING), error)
+    columns = len(rows[0])
+    step = [dot([row[j] for row in rows], weights) for j in range(columns)]
+    largest: Scalar = ca.fabs(step[0])
+    for x in step[1:]:
+        largest = ca.fmax(largest, ca.fabs(x))
+    factor = ca.fmin(1.0, max_step / ca.fmax(largest, 1e-9))
+    return scale(step, factor), factor
+
+
+def _clip(x: Scalar, robot: "Robot", i: int) -> Scalar:
+    import casadi as ca
+
+    return ca.fmin(ca.fmax(x, float(robot.position_lower[i])), float(robot.position_upper[i]))

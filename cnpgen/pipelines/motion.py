@@ -1,0 +1,200 @@
+"""Stages: velocity and acceleration of the start, at rest or random and exactly on the table manifold."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.constraints.table import Table
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stage import Batch, Run, Stage
+from cnpgen.robots.linalg import Scalar, add, dot, scale
+from cnpgen.robots.symbolic import Vec, bias_acceleration, forward_kinematics, inverse_dynamics, symbols, tip_velocity
+from cnpgen.schema import field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+
+def _motion_fields(context: Context, end: str) -> tuple[Field, Field]:
+    role = "input" if end == "start" else "target"
+    return (
+        context.joint_field(f"{end}_dq", "rad/s", f"joint velocities at the {end}", role),
+        context.joint_field(f"{end}_ddq", "rad/s^2", f"joint accelerations at the {end}", role),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AtRest(Stage):
+    """Velocity and acceleration zero at one end; the goal's acceleration is not stored."""
+
+    end: str = field("which end is at rest", choices=("start", "goal"))
+
+    def describe(self) -> str:
+        """Say which end."""
+        return f"set velocity and acceleration of the {self.end} to zero"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """Velocity, and for the start the acceleration."""
+        fields = _motion_fields(context, self.end)
+        return fields if self.end == "start" else fields[:1]
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        """Also the goal's acceleration, for the checks."""
+        del context
+        return f"{self.end}_dq", f"{self.end}_ddq"
+
+    def prepare(self, context: Context) -> Run:
+        """Nothing to load."""
+        n = context.robot.n
+
+        def run(batch: Batch, _random: np.random.Generator) -> None:
+            for name in (f"{self.end}_dq", f"{self.end}_ddq"):
+                batch[name] = np.zeros((n, len(batch.alive)))
+
+        return run
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableVelocity(Stage):
+    """A random start velocity with ``J_z dq = 0``: a uniform direction in the box of the limits, projected, at uniform length."""
+
+    needs = ("start_q",)
+    at_rest: float = field("fraction of the starts that are at rest", low=0.0, high=1.0, default=0.0)
+
+    def describe(self) -> str:
+        """Say how often at rest."""
+        return f"draw a start velocity on the table manifold within the limits, zero in {self.at_rest:.4g} of the cases"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The velocity."""
+        return _motion_fields(context, "start")[:1]
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        """Also the velocity of the tip."""
+        del context
+        return "start_dq", "start_tip_velocity"
+
+    def prepare(self, context: Context) -> Run:
+        """Load the kernel."""
+        context.constraint(Table, "table-velocity")
+        kernel, n = context.kernels.load(table_velocity), context.robot.n
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            direction, length, choice = 2 * batch.draw(random, n) - 1, batch.draw(random, 1), batch.draw(random, 1)
+            length[choice < self.at_rest] = 0.0
+            batch["start_dq"], batch["start_tip_velocity"] = kernel(batch["start_q"], direction, length)
+            batch.reject(np.isfinite(batch["start_dq"]).all(0), "no velocity on the manifold")
+
+        return run
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableAcceleration(Stage):
+    """A random acceleration with ``J_z ddq + dJ_z dq = 0`` at one end, within the acceleration and torque limits."""
+
+    end: str = field("which end", choices=("start", "goal"), default="start")
+
+    @property
+    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Position and velocity of that end."""
+        return f"{self.end}_q", f"{self.end}_dq"
+
+    def describe(self) -> str:
+        """Say where."""
+        return f"draw an acceleration of the {self.end} on the table manifold, within the acceleration and torque limits"
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The acceleration."""
+        return _motion_fields(context, self.end)[1:]
+
+    def prepare(self, context: Context) -> Run:
+        """Load the kernel."""
+        context.constraint(Table, "table-acceleration")
+        kernel, n = context.kernels.load(table_acceleration), context.robot.n
+
+        def run(batch: Batch, random: np.random.Generator) -> None:
+            direction, length = 2 * batch.draw(random, n) - 1, batch.draw(random, 1)
+            acceleration, room = kernel(batch[f"{self.end}_q"], batch[f"{self.end}_dq"], direction, length)
+            batch[f"{self.end}_ddq"] = acceleration
+            batch.reject(room[0] >= 0, f"no acceleration within the limits at the {self.end}")
+
+        return run
+
+
+def table_velocity(robot: "Robot") -> Any:
+    """Build ``(q, direction, length) -> (dq, tip velocity)`` with ``J_z dq = 0``.
+
+    The direction, in units of the limits, is projected on the manifold under the metric of the limits, stretched until the
+    first joint meets its limit, and multiplied by the length in [0, 1).
+
+    Args:
+        robot: The robot.
+    """
+    import casadi as ca
+
+    (q_sx, q), (u_sx, u), (s_sx, s) = symbols("q", robot.n), symbols("u", robot.n), symbols("s", 1)
+    kin = forward_kinematics(robot.chain, q)
+    limit = [float(x) for x in robot.velocity_limit]
+    on_manifold = _project([x * bound for x, bound in zip(u, limit, strict=True)], [c[2] for c in kin.jacobian], limit)
+    largest: Scalar = ca.SX(0)
+    for x, bound in zip(on_manifold, limit, strict=True):
+        largest = ca.fmax(largest, ca.fabs(x) / bound)
+    dq = scale(on_manifold, s[0] / largest)
+    return ca.Function("table_velocity", [q_sx, u_sx, s_sx], [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))])
+
+
+def table_acceleration(robot: "Robot") -> Any:
+    """Build ``(q, dq, direction, length) -> (ddq, room)`` with ``J_z ddq + dJ_z dq = 0``.
+
+    ``ddq = particular + t * projected direction`` with the particular solution of least weighted maximum norm. Torque is affine in
+    t (two inverse dynamics), so every limit is an interval of t; t is uniform in their intersection. ``room`` is its length,
+    negative where the particular solution itself is outside a limit.
+
+    Args:
+        robot: The robot.
+    """
+    import casadi as ca
+
+    (q_sx, q), (dq_sx, dq), (u_sx, u), (s_sx, s) = (
+        symbols(name, width) for name, width in (("q", robot.n), ("dq", robot.n), ("u", robot.n), ("s", 1))
+    )
+    kin = forward_kinematics(robot.chain, q)
+    limit = [float(x) for x in robot.acceleration_limit]
+    row = [column[2] for column in kin.jacobian]
+    size: Scalar = 0.0
+    for bound, x in zip(limit, row, strict=True):
+        size = size + bound * ca.fabs(x)
+    share = -bias_acceleration(kin, dq)[2] / size
+    particular = [share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)]
+    direction = _project([x * bound for x, bound in zip(u, limit, strict=True)], row, limit)
+    torque = inverse_dynamics(robot.chain, q, dq, particular)
+    shifted = inverse_dynamics(robot.chain, q, dq, add(particular, direction))
+    change = [b - a for a, b in zip(torque, shifted, strict=True)]
+    bounds = [*limit, *(float(x) for x in robot.torque_limit)]
+    low, high = _interval([*particular, *torque], [*direction, *change], bounds)
+    t = low + s[0] * (high - low)
+    ddq = add(particular, scale(direction, t))
+    admissible = ca.logic_and(low <= 0, 0 <= high)
+    room = ca.if_else(admissible, high - low, -1.0)
+    return ca.Function("table_acceleration", [q_sx, dq_sx, u_sx, s_sx], [ca.vertcat(*ddq), room])
+
+
+def _project(x: Vec, row: Vec, weight: list[float]) -> Vec:
+    """Project x on ``{row . x = 0}`` in the metric ``diag(weight)^-2``."""
+    spread = [bound * bound * r for bound, r in zip(weight, row, strict=True)]
+    miss = dot(row, x) / dot(row, spread)
+    return [value - s * miss for value, s in zip(x, spread, strict=True)]
+
+
+def _interval(at_zero: Vec, slope: Vec, bounds: list[float]) -> tuple[Scalar, Scalar]:
+    """Interval of t where ``|at_zero + t slope| <= bounds`` in every component."""
+    import casadi as ca
+
+    low, high = ca.SX(-1e9), ca.SX(1e9)
+    for value, rate, bound in zip(at_zero, slope, bounds, strict=True):
+        inverse = 1.0 / rate
+        one, two = (bound - value) * inverse, (-bound - value) * inverse
+        low, high = ca.fmax(low, ca.fmin(one, two)), ca.fmin(high, ca.fmax(one, two))
+    return low, high

@@ -1,0 +1,176 @@
+"""A pipeline ready to run: blocks of rows, each a pure function of (seed, split, block index)."""
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+from cnpgen.errors import RecipeError
+from cnpgen.fields import Field
+from cnpgen.kernels.library import Backend, KernelLibrary
+from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stage import Array, Batch, Run
+from cnpgen.pipelines.tally import Tally
+from cnpgen.recipes import Pipeline
+from cnpgen.robots.robot import load_robot
+from cnpgen.store.outcome import Outcome
+
+BLOCK_ROWS = 4096
+LARGEST_ROUND = 8192
+SMALLEST_ROUND = 256
+HOPELESS = 1e-4  # acceptance below which a pipeline is given up, once it has had a fair chance
+FAIR_CHANCE = 100_000  # draws
+
+# Stored order of the fields that the shipped stages write; others follow in the order of their stages.
+ORDER = (
+    "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq", "start_xyz", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_max",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Block:
+    """Accepted rows, in draw order, and what became of every draw up to the last of them.
+
+    Attributes:
+        columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
+        outcome: Draws, rejections and densities.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    outcome: Outcome
+
+
+class PreparedPipeline:
+    """Stages with their kernels loaded.
+
+    Args:
+        pipeline: The recipe.
+        backend: Which kernels to run.
+        cache_folder: Where kernels are cached.
+        dtype: "float64" or "float32": what rows are stored as, and checked as.
+
+    Attributes:
+        context: Problem, robot and kernels.
+        fields: The fields of a row, in stored order.
+    """
+
+    def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
+        problem = pipeline.problem
+        robot = load_robot(problem)
+        kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})
+        self.pipeline = pipeline
+        self.context = Context(problem, robot, kernels, dtype)
+        self.fields = _ordered_fields(pipeline, self.context)
+        written = _check_needs(pipeline, self.context)
+        self._stages: list[Run] = [stage.prepare(self.context) for stage in pipeline.stage]
+        self._accept = acceptance(self.context, written)
+
+    def block(self, seed: int, split: str, index: int, rows: int = BLOCK_ROWS) -> Block:
+        """Make the first ``rows`` rows of one block.
+
+        Args:
+            seed: Root seed of the dataset.
+            split: Name of the split.
+            index: Index of the block in the split.
+            rows: How many rows; fewer rows are the first of the whole block.
+
+        Raises:
+            RecipeError: Practically no draw is accepted.
+        """
+        random = random_generator(seed, split, index)
+        tally = Tally(self.fields)
+        parts: list[dict[str, NDArray[Any]]] = []
+        while tally.accepted < rows:
+            batch = self._round(random, _round_size(tally))
+            taken = batch.alive[: rows - tally.accepted]
+            full = tally.accepted + len(taken) == rows
+            attempts = tally.count(batch, int(taken[-1]) + 1 if full else batch.size, taken)
+            part = {field.name: batch[field.name][:, : len(taken)] for field in self.fields[:-2]}
+            parts.append({**part, "attempts": attempts[None]})
+            self._check_hope(tally)
+        columns = {name: np.concatenate([part[name] for part in parts], axis=1) for name in parts[0]}
+        columns["sample_id"] = index * BLOCK_ROWS + np.arange(rows, dtype=np.int64)[None]
+        return Block(columns, tally.outcome())
+
+    def _round(self, random: np.random.Generator, size: int) -> Batch:
+        batch = Batch(size)
+        for run in self._stages:
+            run(batch, random)
+        if self.context.dtype == "float32":
+            for field in self.fields:
+                if field.name in batch.columns:
+                    batch[field.name] = as_stored(batch[field.name], field)
+        self._accept(batch, random)
+        return batch
+
+    def _check_hope(self, tally: Tally) -> None:
+        if tally.tried >= FAIR_CHANCE and tally.accepted < HOPELESS * tally.tried:
+            outcome = tally.outcome()
+            worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]
+            reasons = ", ".join(f"{reason}: {count}" for reason, count in worst)
+            raise RecipeError(
+                [f"{self.pipeline.path}: {outcome.accepted} of {outcome.tried} draws were accepted; rejected mostly for {reasons}"]
+            )
+
+
+def random_generator(seed: int, split: str, index: int) -> np.random.Generator:
+    """Return the random numbers of one block: SFC64 seeded by a SeedSequence of (seed; split, block)."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(split.encode()), index))
+    return np.random.Generator(np.random.SFC64(sequence))
+
+
+def as_stored(values: Array, field: Field) -> Array:
+    """Round to float32 and back; what would be rounded beyond a limit of the field is rounded inwards."""
+    rounded = values.astype(np.float32)
+    for bound, inwards, beyond in ((field.valid_min, np.inf, np.less), (field.valid_max, -np.inf, np.greater)):
+        if bound is not None:
+            limit = np.array(bound)[:, None]
+            stored = limit.astype(np.float32)
+            stored = np.where(beyond(stored, limit), np.nextafter(stored, np.float32(inwards)), stored)
+            rounded = np.where(beyond(rounded, limit) & ~beyond(values, limit), stored, rounded)
+    return rounded.astype(np.float64)
+
+
+def _round_size(tally: Tally) -> int:
+    """How many draws the next round has: what the block's own acceptance so far says is missing, and a little more."""
+    if tally.tried == 0:
+        return BLOCK_ROWS // 2
+    if tally.accepted == 0:
+        return LARGEST_ROUND
+    missing = (BLOCK_ROWS - tally.accepted) * tally.tried / tally.accepted
+    return int(np.clip(np.ceil(1.03 * missing) + 32, SMALLEST_ROUND, LARGEST_ROUND))
+
+
+def _ordered_fields(pipeline: Pipeline, context: Context) -> tuple[Field, ...]:
+    """Merge what the stages provide; a later stage may overwrite a field but not change what it is."""
+    fields: dict[str, Field] = {}
+    for stage in pipeline.stage:
+        for field in stage.provides(context):
+            fields[field.name] = field
+    known = [fields.pop(name) for name in ORDER if name in fields]
+    return (*known, *fields.values(), *bookkeeping_fields())
+
+
+def _check_needs(pipeline: Pipeline, context: Context) -> set[str]:
+    """Return the columns that the stages write; raise RecipeError where a stage needs one that none before it writes."""
+    written: set[str] = set()
+    mistakes = []
+    for number, stage in enumerate(pipeline.stage, start=1):
+        missing = [name for name in stage.needs if name not in written]
+        if missing:
+            mistakes.append(
+                f"{pipeline.path}: stage {number} ({type(stage).__name__}) needs {', '.join(missing)}, which no stage before it writes"
+            )
+        written.update(stage.writes(context))
+    needed = ("start_q", "start_dq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
+    mistakes.extend(f"{pipeline.path}: no stage writes {name}, which every sample must have" for name in needed if name not in written)
+    if mistakes:
+        raise RecipeError(mistakes)
+    return written
+
+

@@ -1,0 +1,103 @@
+"""The contract of a stage, and the batch of draws that stages work on."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.fields import Field
+
+if TYPE_CHECKING:
+    from cnpgen.pipelines.context import Context
+
+Array = NDArray[np.float64]
+
+
+class Batch:
+    """A round of draws and the columns that are known of those still alive.
+
+    Attributes:
+        size: Number of draws of the round, N.
+        alive: Index of each surviving draw in the round, shape (n,), ascending.
+        fate: For every draw of the round, 0 while alive, else 1 + the index of its reason, shape (N,).
+        reasons: The reasons seen so far, in order of first use.
+        columns: Name -> values of the surviving draws, shape (width, n), contiguous rows.
+        drawn: Name -> values of all draws, shape (width, N), for columns written before any rejection.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.alive = np.arange(size)
+        self.fate = np.zeros(size, np.uint16)
+        self.reasons: list[str] = []
+        self.columns: dict[str, Array] = {}
+        self.drawn: dict[str, Array] = {}
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    def __setitem__(self, name: str, values: Array) -> None:
+        if values.ndim != 2 or values.shape[1] != len(self.alive):
+            raise ValueError(f"column {name!r} must have shape (width, {len(self.alive)}), got {values.shape}")
+        self.columns[name] = values
+        if len(self.alive) == self.size:
+            self.drawn[name] = values
+
+    def draw(self, random: np.random.Generator, width: int) -> Array:
+        """Draw uniform numbers in [0, 1) for every draw of the round and return those of the survivors, shape (width, n)."""
+        numbers = random.random((width, self.size))
+        return numbers if len(self.alive) == self.size else np.take(numbers, self.alive, axis=1)
+
+    def reject(self, ok: NDArray[np.bool_], reason: str) -> None:
+        """End the draws where ``ok`` (shape (n,)) is false under ``reason`` and drop them from every column."""
+        if reason not in self.reasons:
+            self.reasons.append(reason)
+        if ok.all():
+            return
+        self.fate[self.alive[~ok]] = 1 + self.reasons.index(reason)
+        keep = np.flatnonzero(ok)
+        self.alive = self.alive[keep]
+        self.columns = {name: np.take(values, keep, axis=1) for name, values in self.columns.items()}
+
+
+Run = Callable[[Batch, np.random.Generator], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage(ABC):
+    """One step of a pipeline.
+
+    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table; it is registered under a name
+    in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.stages``.
+
+    Attributes:
+        needs: Columns that earlier stages must have written.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def describe(self) -> str:
+        """Say in one sentence, with this stage's numbers and their units, what it does."""
+
+    @abstractmethod
+    def provides(self, context: "Context") -> tuple[Field, ...]:
+        """List the fields that this stage writes into the dataset, in order."""
+
+    def writes(self, context: "Context") -> tuple[str, ...]:
+        """List the columns that this stage writes, stored or not; by default the fields that it provides."""
+        return tuple(field.name for field in self.provides(context))
+
+    @abstractmethod
+    def prepare(self, context: "Context") -> Run:
+        """Load what the stage needs (kernels, geometry) and return the function that works on a batch.
+
+        Args:
+            context: The problem, its robot and the kernel loader.
+
+        Returns:
+            A function of (batch, random) that writes columns and rejects draws. It must use ``batch.draw`` for randomness.
+        """

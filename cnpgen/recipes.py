@@ -1,0 +1,216 @@
+"""Problem, Pipeline and DatasetRecipe: the three nouns that users write as TOML files."""
+
+# ruff: noqa: RUF009 - cnpgen.schema.field is dataclasses.field with metadata
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from cnpgen import plugins
+from cnpgen.constraints.constraint import Constraint
+from cnpgen.errors import UsageError
+from cnpgen.pipelines.stage import Stage
+from cnpgen.schema import Range, field, to_dict
+
+NAME = "^[a-z0-9][a-z0-9-]*$"
+SPLIT_NAME = "^[a-z][a-z0-9_-]*$"
+VERSION = r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSpec:
+    """Which robot: a URDF file, the joints that are planned and the frame that the task is about."""
+
+    urdf: str = field("URDF file, relative to the problem file")
+    joints: tuple[str, ...] = field("planned joints, in order; all others stay at zero")
+    tip: str = field("name of the frame (URDF link) that the task is about")
+    base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad")
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
+        if twice:
+            yield "joints", f"each joint can be planned once, got {', '.join(twice)} more than once"
+        if len(self.base) != len(self.joints):
+            yield "base", f"expected {len(self.joints)} numbers, one per planned joint, got {len(self.base)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitSpec:
+    """Planning limits as fractions of the URDF's."""
+
+    position_scale: float = field("planning limit / URDF limit of joint positions", default=1.0, low=1e-3, high=1.0)
+    velocity_scale: float = field("planning limit / URDF limit of joint velocities", default=1.0, low=1e-3, high=1.0)
+    acceleration_rate: float = field("acceleration limit / velocity limit", unit="1/s", default=10.0, low=1e-3)
+    acceleration_cap: float = field("no acceleration limit is above this", unit="rad/s^2", default=20.0, low=1e-3)
+    torque_scale: float = field("planning limit / URDF limit of joint torques", default=1.0, low=1e-3, high=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldObject:
+    """An upright cuboid rigidly held at the tip frame, its centre."""
+
+    size: tuple[float, float, float] = field("edge lengths along the tip frame's x, y, z", unit="m", low=1e-6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """An axis-aligned box of the world; without ``top`` the box ends ``below`` the object at that end of the motion."""
+
+    name: str = field("name of the obstacle")
+    x: Range = field("extent along world x", unit="m")
+    y: Range = field("extent along world y", unit="m")
+    height: float = field("height of the box, measured down from its top", unit="m", default=4.0, low=1e-6)
+    top: float | None = field("height of its upper face", unit="m", default=None)
+    below: str = field("the end whose object stands on this box", choices=("", "start", "goal"), default="")
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        if self.top is None and not self.below:
+            yield "top", f"obstacle {self.name!r} has no height: expected a 'top', or 'below' = \"start\" or \"goal\""
+        if self.top is not None and self.below:
+            yield "top", f"obstacle {self.name!r} has both a 'top' and a 'below', expected one of them"
+        for key, extent in (("x", self.x), ("y", self.y)):
+            if extent.low == extent.high:
+                yield key, f"obstacle {self.name!r} has no extent here, expected a low end below the high end"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectorySpec:
+    """How motions are parameterised (paper, section on trajectory parameterisation)."""
+
+    degree: int = field("degree of both B-splines", default=7, low=3)
+    path_control_points: int = field("control points of p(s)", default=15, low=6)
+    rate_control_points: int = field("control points of r(s)", default=20, low=4)
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        for key in ("path_control_points", "rate_control_points"):
+            if getattr(self, key) <= self.degree:
+                yield (
+                    key,
+                    f"a spline of degree {self.degree} needs at least {self.degree + 1}, got {getattr(self, key)}",
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """What a valid motion is.
+
+    Attributes:
+        path: The problem file; the URDF is looked up beside it.
+        digest: sha256 of the problem file and its URDF.
+    """
+
+    name: str = field("name of the problem: lower-case letters, digits and hyphens", pattern=NAME)
+    title: str = field("one line about it", default="")
+    robot: RobotSpec = field("the robot")
+    limits: LimitSpec = field("its planning limits")
+    object: HeldObject | None = field("what it holds", default=None)
+    obstacle: tuple[Obstacle, ...] = field("the boxes of the world", default=())
+    constraint: tuple[Constraint, ...] = field("the constraint manifold", default=())
+    trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
+    path: Path = Path()
+    digest: str = ""
+
+    @property
+    def urdf_path(self) -> Path:
+        """The URDF file."""
+        return self.path.parent / self.robot.urdf
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline:
+    """How the boundary conditions of a problem are drawn."""
+
+    name: str = field("name of the pipeline: lower-case letters, digits and hyphens", pattern=NAME)
+    title: str = field("one line about it", default="")
+    problem: Problem = field(
+        "name of a shipped problem, or path of a problem file relative to this one", form="a name or a path"
+    )
+    stage: tuple[Stage, ...] = field("the steps, in order")
+    path: Path = Path()
+    digest: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetRecipe:
+    """How many rows of which pipeline, from which seed, split how.
+
+    Attributes:
+        splits: Split name -> rows; the first split takes what rounding leaves when the sizes are scaled by ``--n``.
+    """
+
+    name: str = field("name of the dataset: lower-case letters, digits and hyphens", pattern=NAME)
+    version: str = field("version of the dataset, MAJOR.MINOR.PATCH", default="1.0.0", pattern=VERSION)
+    title: str = field("one line about it", default="")
+    pipeline: Pipeline = field(
+        "name of a shipped pipeline, or path of a pipeline file relative to this one", form="a name or a path"
+    )
+    seed: int = field("root seed", default=0, low=0, high=2**63 - 1)
+    splits: dict[str, int] = field("rows per split", low=1, pattern=SPLIT_NAME)
+    license: str = field("licence of the rows", default="CC-BY-4.0")
+    path: Path = Path()
+    digest: str = ""
+
+
+def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
+    """Scale the splits of a recipe to ``n`` rows in total.
+
+    Every split gets its proportional share rounded down; the few rows that are left go one by one to the split that has
+    the most rows in the recipe per row it would then have, the first one on a tie. This is D'Hondt's rule: no split
+    shrinks when ``n`` grows, so a longer run of a recipe extends a shorter one. (Giving all of the rest to the first
+    split would not do: of 80 + 10 + 10, n = 9 would give it 9 rows and n = 10 only 8.)
+
+    Args:
+        recipe: The recipe.
+        n: Rows of all splits together, at least 1.
+
+    Returns:
+        Split name -> rows, in the recipe's order, without splits that would be empty; the recipe's own numbers if ``n``
+        is their sum.
+
+    Raises:
+        UsageError: ``n`` is less than 1.
+    """
+    if n < 1:
+        raise UsageError(f"the number of rows must be at least 1, got {n}")
+    total = sum(recipe.splits.values())
+    rows = {name: n * share // total for name, share in recipe.splits.items()}
+    for _ in range(n - sum(rows.values())):
+        rows[max(rows, key=lambda name: Fraction(recipe.splits[name], rows[name] + 1))] += 1
+    return {name: count for name, count in rows.items() if count > 0}
+
+
+def resolved(recipe: Problem | Pipeline | DatasetRecipe) -> dict[str, Any]:
+    """Return a recipe with everything it refers to and every default as plain dicts and lists, in SI units."""
+    return to_dict(recipe, label=_use)
+
+
+def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
+    """Hash all that decides which rows a seed gives, and nothing else.
+
+    That is the resolved pipeline and problem and the content of the URDF: not titles, comments, paths, the seed or the
+    splits. Writing "5 mm" for 0.005 or a default explicitly does not change it.
+
+    Returns:
+        sha256, as 64 hexadecimal digits.
+    """
+    pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
+    content = resolved(pipeline)
+    problem, urdf = content["problem"], pipeline.problem.urdf_path.read_bytes()
+    del content["title"], problem["title"], problem["robot"]["urdf"]
+    content["urdf_sha256"] = hashlib.sha256(urdf).hexdigest()
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _use(obj: object) -> dict[str, str]:
+    """Label a stage or a constraint with the name of its kind."""
+    for group, base in plugins.BASES.items():
+        if isinstance(obj, base):
+            return {"use": plugins.name_of(group, type(obj))}
+    return {}

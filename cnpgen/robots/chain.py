@@ -1,0 +1,104 @@
+"""The numbers of a serial chain: joint placements, axes and inertias of a reduced Pinocchio model."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One planned joint and the rigid body that it moves.
+
+    Attributes:
+        rotation: Rotation of the joint frame in the previous joint frame at q = 0, shape (3, 3).
+        translation: Its origin there [m], shape (3,).
+        axis: Unit axis in the joint frame, shape (3,).
+        prismatic: Whether q is a displacement [m] and not an angle [rad].
+        mass: Mass of the body with everything fixed to it [kg].
+        com: Centre of mass in the joint frame [m], shape (3,).
+        inertia: Inertia about the centre of mass, joint axes [kg m^2], shape (3, 3).
+    """
+
+    rotation: Array
+    translation: Array
+    axis: Array
+    prismatic: bool
+    mass: float
+    com: Array
+    inertia: Array
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A serial chain from the world to a tip frame.
+
+    Attributes:
+        joints: The planned joints, from the base outwards.
+        tip_rotation: Rotation of the tip frame in the last joint frame, shape (3, 3).
+        tip_translation: Origin of the tip frame there [m], shape (3,).
+        gravity: Gravity in the world frame [m/s^2], shape (3,).
+    """
+
+    joints: tuple[Joint, ...]
+    tip_rotation: Array
+    tip_translation: Array
+    gravity: Array
+
+    @property
+    def reach(self) -> float:
+        """Upper bound of the distance of the tip from the first joint's origin [m] (revolute chains)."""
+        lengths = [float(np.linalg.norm(joint.translation)) for joint in self.joints[1:]]
+        return sum(lengths) + float(np.linalg.norm(self.tip_translation))
+
+
+def chain_from_model(model: "pin.Model", tip: str) -> Chain:
+    """Read the chain that ends in frame ``tip`` from a reduced Pinocchio model.
+
+    Raises:
+        RecipeError: The model is not one serial chain of one-degree-of-freedom joints that carries the tip.
+    """
+    data = model.createData()
+    for index in range(1, model.njoints):
+        kind = model.joints[index].shortname()
+        if model.joints[index].nq != 1 or model.joints[index].nv != 1:
+            raise RecipeError([f"{model.names[index]}: joints of type {kind} are not supported, only revolute and prismatic ones"])
+        if model.parents[index] != index - 1:
+            raise RecipeError([f"{model.names[index]}: the planned joints do not form one serial chain"])
+    frame = model.frames[model.getFrameId(tip)]
+    if frame.parentJoint != model.njoints - 1:
+        raise RecipeError([f"tip frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
+    joints = tuple(_joint(model, data, index) for index in range(1, model.njoints))
+    return Chain(joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear))
+
+
+def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:
+    placement, inertia = model.jointPlacements[index], model.inertias[index]
+    subspace = np.asarray(data.joints[index].S, float).ravel()  # (linear, angular)
+    prismatic = bool(np.abs(subspace[3:]).max() < 0.5)
+    return Joint(
+        rotation=_snap(placement.rotation),
+        translation=_snap(placement.translation),
+        axis=_snap(subspace[:3] if prismatic else subspace[3:]),
+        prismatic=prismatic,
+        mass=float(inertia.mass),
+        com=np.array(inertia.lever),
+        inertia=np.array(inertia.inertia),
+    )
+
+
+def _snap(values: Array, tolerance: float = 1e-12) -> Array:
+    """Round entries within ``tolerance`` of -1, 0 or 1: a URDF's pi/2 must not cost operations in every kernel."""
+    values = np.array(values, float)
+    nearest = np.rint(values)
+    close = (np.abs(values - nearest) < tolerance) & (np.abs(nearest) <= 1)
+    values[close] = nearest[close]
+    return values

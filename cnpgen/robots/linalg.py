@@ -1,0 +1,93 @@
+"""The small linear algebra of a step, as SX scalars: products, symmetric solves. No branches, no pivoting."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+Scalar = Any  # a CasADi SX of shape (1, 1) or a float
+Vector = Sequence[Scalar]
+Matrix = Sequence[Sequence[Scalar]]
+
+
+def dot(a: Vector, b: Vector) -> Scalar:
+    """Return the sum of products of two vectors of equal length."""
+    total: Scalar = 0.0
+    for x, y in zip(a, b, strict=True):
+        total = total + x * y
+    return total
+
+
+def cross(a: Vector, b: Vector) -> list[Scalar]:
+    """Return the cross product of two 3-vectors."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def add(a: Vector, b: Vector) -> list[Scalar]:
+    """Return ``a + b``."""
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
+def subtract(a: Vector, b: Vector) -> list[Scalar]:
+    """Return ``a - b``."""
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def scale(a: Vector, factor: Scalar) -> list[Scalar]:
+    """Return ``factor * a``."""
+    return [x * factor for x in a]
+
+
+def gram(rows: Matrix, damping: float = 0.0) -> list[list[Scalar]]:
+    """Return the lower triangle of ``A A^T + damping I`` for the rows of A."""
+    m = len(rows)
+    return [[dot(rows[i], rows[j]) + (damping if i == j else 0.0) for j in range(i + 1)] for i in range(m)]
+
+
+def factorize(lower: Matrix, safeguard: Callable[[Scalar], Scalar] | None = None) -> tuple[list[list[Scalar]], list[Scalar]]:
+    """Factorize a symmetric matrix as ``L D L^T``.
+
+    Args:
+        lower: Lower triangle, row i of length i + 1.
+        safeguard: Applied to every pivot, e.g. to keep it positive; None takes it as it is.
+
+    Returns:
+        ``(L, inverse of D)``: the strictly lower triangle of L, row i of length i, and 1 / D.
+    """
+    factor: list[list[Scalar]] = []
+    inverse: list[Scalar] = []
+    for i, entries in enumerate(lower):
+        row: list[Scalar] = []
+        scaled: list[Scalar] = []  # row i of L D
+        for j in range(i):
+            value = entries[j] - dot(scaled, factor[j]) if j else entries[0]
+            scaled.append(value)
+            row.append(value * inverse[j])
+        pivot = entries[i] - dot(row, scaled) if i else entries[0]
+        inverse.append(1.0 / (safeguard(pivot) if safeguard else pivot))
+        factor.append(row)
+    return factor, inverse
+
+
+def substitute(factor: Matrix, inverse: Vector, right: Vector) -> list[Scalar]:
+    """Solve ``L D L^T x = right`` with the result of ``factorize``."""
+    x = list(right)
+    m = len(x)
+    for i in range(m):
+        for j in range(i):
+            x[i] = x[i] - factor[i][j] * x[j]
+    x = [value * pivot for value, pivot in zip(x, inverse, strict=True)]
+    for i in reversed(range(m)):
+        for j in range(i + 1, m):
+            x[i] = x[i] - factor[j][i] * x[j]
+    return x
+
+
+def solve(lower: Matrix, right: Vector) -> list[Scalar]:
+    """Solve a symmetric system given by its lower triangle."""
+    return substitute(*factorize(lower), right)
+
+
+def inverse3(columns: Matrix) -> list[list[Scalar]]:
+    """Return the rows of the inverse of the 3 x 3 matrix with these columns."""
+    rows = [cross(columns[1], columns[2]), cross(columns[2], columns[0]), cross(columns[0], columns[1])]
+    reciprocal = 1.0 / dot(columns[0], rows[0])
+    return [scale(row, reciprocal) for row in rows]

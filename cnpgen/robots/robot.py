@@ -1,0 +1,171 @@
+"""A robot: its Pinocchio model reduced to the planned joints, and the planning limits that the problem sets."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.recipes import Problem
+from cnpgen.robots.chain import Chain, chain_from_model
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What every stage, kernel and check needs to know about the robot of a problem.
+
+    Attributes:
+        urdf: The URDF file.
+        joint_names: The n planned joints; every other joint of the URDF stays at zero.
+        tip: Name of the frame that the task is about.
+        position_lower: Planning limits of joint positions [rad], shape (n,).
+        position_upper: Likewise, shape (n,).
+        velocity_limit: Symmetric planning limit of joint velocities [rad/s], shape (n,).
+        acceleration_limit: Symmetric planning limit of joint accelerations [rad/s^2], shape (n,).
+        torque_limit: Symmetric planning limit of joint torques [N m], shape (n,).
+        rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
+        base: Base configuration [rad], shape (n,).
+        chain: The numbers of the kinematic chain from the world to the tip.
+    """
+
+    urdf: Path
+    joint_names: tuple[str, ...]
+    tip: str
+    position_lower: Array
+    position_upper: Array
+    velocity_limit: Array
+    acceleration_limit: Array
+    torque_limit: Array
+    rated_velocity: Array
+    base: Array
+    chain: Chain
+
+    @property
+    def n(self) -> int:
+        """Number of planned joints."""
+        return len(self.joint_names)
+
+    @cached_property
+    def skeleton(self) -> tuple[tuple[int, int], ...]:
+        """Segments that stand for the moving links: index pairs into (joint origins..., tip).
+
+        Origins of successive joints are joined; points that coincide are merged, collinear neighbours (links of one straight
+        piece) become one segment, and what joint 1 cannot move is left out.
+        """
+        return _skeleton(self.model, self.tip)
+
+    @cached_property
+    def model(self) -> "pin.Model":
+        """The Pinocchio model reduced to the planned joints."""
+        return _reduced_model(self.urdf, self.joint_names)
+
+
+def load_robot(problem: Problem) -> Robot:
+    """Load the robot of a problem.
+
+    Raises:
+        RecipeError: The URDF cannot be read, or joints, tip, base configuration and limits do not fit it.
+    """
+    spec, limits = problem.robot, problem.limits
+    urdf = problem.path.parent / spec.urdf
+    model = _reduced_model(urdf, spec.joints)
+    if not model.existFrame(spec.tip):
+        known = [frame.name for frame in model.frames]
+        raise RecipeError([f"{problem.path}: robot.tip: {urdf.name} has no frame {spec.tip!r}{nearest(spec.tip, known)}"])
+    velocity = limits.velocity_scale * np.array(model.velocityLimit)
+    middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
+    half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
+    robot = Robot(
+        urdf=urdf,
+        joint_names=tuple(spec.joints),
+        tip=spec.tip,
+        position_lower=middle - half,
+        position_upper=middle + half,
+        velocity_limit=velocity,
+        acceleration_limit=np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap),
+        torque_limit=limits.torque_scale * np.array(model.effortLimit),
+        rated_velocity=np.array(model.velocityLimit),
+        base=np.array(spec.base),
+        chain=chain_from_model(model, spec.tip),
+    )
+    _check(problem, robot)
+    return robot
+
+
+def _reduced_model(urdf: Path, joints: tuple[str, ...]) -> "pin.Model":
+    import pinocchio as pin
+
+    try:
+        model = pin.buildModelFromUrdf(str(urdf))
+    except (ValueError, RuntimeError) as error:
+        raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
+    known = list(model.names)[1:]
+    missing = [f"{urdf.name} has no joint {name!r}{nearest(name, known)}" for name in joints if name not in known]
+    if missing:
+        raise RecipeError([f"robot.joints: {text}" for text in missing])
+    locked = [index for index in range(1, model.njoints) if model.names[index] not in joints]
+    reduced = pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
+    if tuple(reduced.names)[1:] != tuple(joints):
+        raise RecipeError([f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"])
+    return reduced
+
+
+def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
+    """Merge the chain of joint origins into straight segments; what is straight at random configurations is always so."""
+    import pinocchio as pin
+
+    data, random = model.createData(), np.random.default_rng(0)
+    poses = []
+    for _ in range(4):
+        q = random.uniform(model.lowerPositionLimit, model.upperPositionLimit)
+        pin.framesForwardKinematics(model, data, q)
+        origins = [data.oMi[i].translation for i in range(1, model.njoints)]
+        poses.append(np.array([*origins, data.oMf[model.getFrameId(tip)].translation]))
+    points = np.array(poses)  # (configurations, points, 3)
+
+    def still(a: int) -> bool:
+        return bool(np.ptp(points[:, a], axis=0).max() < 1e-9)
+
+    def straight(a: int, b: int, c: int) -> bool:
+        normal = np.cross(points[:, b] - points[:, a], points[:, c] - points[:, b])
+        return bool(np.abs(normal).max() < 1e-9)
+
+    kept = [0]
+    for point in range(1, points.shape[1]):
+        if np.abs(points[:, point] - points[:, kept[-1]]).max() < 1e-9:
+            continue
+        if len(kept) > 1 and straight(kept[-2], kept[-1], point):
+            kept[-1] = point
+        else:
+            kept.append(point)
+    pairs = zip(kept, kept[1:], strict=False)
+    return tuple((a, b) for a, b in pairs if not (still(a) and still(b)))
+
+
+def _check(problem: Problem, robot: Robot) -> None:
+    """Raise RecipeError for limits that no motion can meet."""
+    mistakes = []
+    if robot.base.shape != (robot.n,):
+        mistakes.append(f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {robot.base.size}")
+    elif np.any(robot.base < robot.position_lower) or np.any(robot.base > robot.position_upper):
+        worst = int(np.argmax(np.maximum(robot.position_lower - robot.base, robot.base - robot.position_upper)))
+        mistakes.append(
+            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {robot.base[worst]:g} rad is outside its planning limits"
+            f" [{robot.position_lower[worst]:g}, {robot.position_upper[worst]:g}]"
+        )
+    for what, limit in (("velocity", robot.velocity_limit), ("torque", robot.torque_limit)):
+        mistakes.extend(
+            f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
+            for name, value in zip(robot.joint_names, limit, strict=True)
+            if not (np.isfinite(value) and value > 0)
+        )
+    if mistakes:
+        raise RecipeError(mistakes)

@@ -1,0 +1,262 @@
+"""Kinematics and dynamics of a chain as CasADi SX: positions, Jacobian, bias acceleration, recursive Newton-Euler.
+
+All vectors are Python lists of SX scalars in the world frame unless said otherwise; structural zeros of the URDF cost nothing.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.chain import Chain, Joint
+from cnpgen.robots.linalg import Scalar, add, cross, dot, scale, subtract
+
+if TYPE_CHECKING:
+    from cnpgen.recipes import Obstacle
+    from cnpgen.robots.robot import Robot
+
+Vec = list[Scalar]
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Positions of a chain at q.
+
+    Attributes:
+        axes: Joint axes z_i, n lists of 3.
+        origins: Joint origins o_i [m], n lists of 3.
+        tip: Tip position p [m], 3.
+        rotation: Tip rotation, 3 rows of 3.
+        jacobian: Columns dp/dq_i [m/rad], n lists of 3.
+        turning: Whether joint i is revolute.
+    """
+
+    axes: list[Vec]
+    origins: list[Vec]
+    tip: Vec
+    rotation: list[Vec]
+    jacobian: list[Vec]
+    turning: list[bool]
+
+
+def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
+    """Positions, axes and tip Jacobian of a chain.
+
+    Args:
+        chain: The chain.
+        q: Joint positions [rad], n scalars.
+    """
+    rotation: list[Vec] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    position: Vec = [0.0, 0.0, 0.0]
+    axes, origins = [], []
+    for joint, angle in zip(chain.joints, q, strict=True):
+        position = add(position, _times(rotation, _constants(joint.translation)))
+        rotation = _product(rotation, _product(_rows(joint.rotation), _turn(joint, angle)))
+        axis = _times(rotation, _constants(joint.axis))
+        if joint.prismatic:
+            position = add(position, scale(axis, angle))
+        axes.append(axis)
+        origins.append(position)
+    tip = add(position, _times(rotation, _constants(chain.tip_translation)))
+    turning = [not joint.prismatic for joint in chain.joints]
+    jacobian = [cross(z, subtract(tip, o)) if turns else z for z, o, turns in zip(axes, origins, turning, strict=True)]
+    return Kinematics(axes, origins, tip, _product(rotation, _rows(chain.tip_rotation)), jacobian, turning)
+
+
+def tip_velocity(kin: Kinematics, dq: Vec) -> Vec:
+    """Linear velocity of the tip [m/s] for joint velocities dq [rad/s]."""
+    return [dot([column[row] for column in kin.jacobian], dq) for row in range(3)]
+
+
+def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
+    """Acceleration of the tip at ddq = 0, ``dJ/dt dq`` [m/s^2]."""
+    omega: Vec = [0.0, 0.0, 0.0]
+    velocity: Vec = [0.0, 0.0, 0.0]  # of the current joint's origin
+    bias: Vec = [0.0, 0.0, 0.0]
+    previous: Vec = [0.0, 0.0, 0.0]
+    tip = tip_velocity(kin, dq)
+    for z, o, column, rate, turns in zip(kin.axes, kin.origins, kin.jacobian, dq, kin.turning, strict=True):
+        velocity = add(velocity, cross(omega, subtract(o, previous)))
+        if turns:
+            moving = cross(z, subtract(tip, velocity))
+            turning = cross(cross(omega, z), subtract(kin.tip, o))
+            bias = add(bias, scale(add(moving, turning), rate))
+            omega = add(omega, scale(z, rate))
+        else:
+            bias = add(bias, scale(cross(omega, column), rate))
+            velocity = add(velocity, scale(z, rate))
+        previous = o
+    return bias
+
+
+def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
+    """Joint torques [N m] by recursive Newton-Euler, in joint frames.
+
+    Args:
+        chain: The chain.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+    """
+    omega: Vec = [0.0, 0.0, 0.0]
+    alpha: Vec = [0.0, 0.0, 0.0]
+    acceleration: Vec = _constants(-chain.gravity)
+    rotations, offsets, forces, moments = [], [], [], []
+    for joint, angle, rate, rate2 in zip(chain.joints, q, dq, ddq, strict=True):
+        rotation = _product(_rows(joint.rotation), _turn(joint, angle))
+        offset = _offset(joint, angle)
+        acceleration = add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
+        acceleration, omega, alpha = (_transposed_times(rotation, x) for x in (acceleration, omega, alpha))
+        axis = _constants(joint.axis)
+        if joint.prismatic:
+            coriolis = scale(cross(omega, scale(axis, rate)), 2.0)
+            acceleration = add(acceleration, add(coriolis, scale(axis, rate2)))
+        else:
+            alpha = add(alpha, add(cross(omega, scale(axis, rate)), scale(axis, rate2)))
+            omega = add(omega, scale(axis, rate))
+        force, moment = _body_wrench(joint, omega, alpha, acceleration)
+        rotations.append(rotation)
+        offsets.append(offset)
+        forces.append(force)
+        moments.append(moment)
+    return _propagate(chain, rotations, offsets, forces, moments)
+
+
+def _body_wrench(joint: Joint, omega: Vec, alpha: Vec, acceleration: Vec) -> tuple[Vec, Vec]:
+    """Force and moment about the joint origin that the body of a joint needs for its motion."""
+    com, inertia = _constants(joint.com), _rows(joint.inertia)
+    at_com = add(acceleration, add(cross(alpha, com), cross(omega, cross(omega, com))))
+    force = scale(at_com, joint.mass)
+    spin = add(_times(inertia, alpha), cross(omega, _times(inertia, omega)))
+    return force, add(spin, cross(com, force))
+
+
+def _propagate(chain: Chain, rotations: list[list[Vec]], offsets: list[Vec], forces: list[Vec], moments: list[Vec]) -> Vec:
+    """Sum wrenches from the tip to the base and project them on the joint axes."""
+    force: Vec = [0.0, 0.0, 0.0]
+    moment: Vec = [0.0, 0.0, 0.0]
+    torques: Vec = []
+    for index in reversed(range(len(chain.joints))):
+        joint = chain.joints[index]
+        force, moment = add(force, forces[index]), add(moment, moments[index])
+        torques.append(dot(_constants(joint.axis), force if joint.prismatic else moment))
+        force = _times(rotations[index], force)
+        moment = add(_times(rotations[index], moment), cross(offsets[index], force))
+    return torques[::-1]
+
+
+@dataclass(frozen=True)
+class SymbolicState:
+    """A robot state as SX, and what constraints ask of it, each built on first use.
+
+    Attributes:
+        robot: The robot.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+        tops: Heights of the obstacles' upper faces [m], one scalar per obstacle.
+        obstacles: The boxes of the world.
+        object_size: Edge lengths of the held object [m], or None.
+    """
+
+    robot: "Robot"
+    q: Vec
+    dq: Vec
+    ddq: Vec
+    tops: Vec
+    obstacles: "tuple[Obstacle, ...]"
+    object_size: tuple[float, float, float] | None
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Positions and Jacobian at q."""
+        return forward_kinematics(self.robot.chain, self.q)
+
+    @cached_property
+    def torque(self) -> Vec:
+        """Inverse dynamics [N m]."""
+        return inverse_dynamics(self.robot.chain, self.q, self.dq, self.ddq)
+
+    @cached_property
+    def tip_velocity(self) -> Vec:
+        """Linear velocity of the tip [m/s]."""
+        return tip_velocity(self.kinematics, self.dq)
+
+    @cached_property
+    def tip_acceleration(self) -> Vec:
+        """Linear acceleration of the tip [m/s^2]."""
+        return add(tip_velocity(self.kinematics, self.ddq), bias_acceleration(self.kinematics, self.dq))
+
+    @property
+    def segments(self) -> list[tuple[Vec, Vec]]:
+        """The moving segments of the robot's skeleton: between the distinct, not collinear joint origins and the tip [m]."""
+        points = [*self.kinematics.origins, self.kinematics.tip]
+        return [(points[a], points[b]) for a, b in self.robot.skeleton]
+
+    @property
+    def boxes(self) -> list[list[tuple[Scalar | None, Scalar | None]]]:
+        """Bounds of the obstacles along x, y, z [m]."""
+        return [
+            [(box.x.low, box.x.high), (box.y.low, box.y.high), (None if box.height is None else top - box.height, top)]
+            for box, top in zip(self.obstacles, self.tops, strict=True)
+        ]
+
+
+def symbols(name: str, width: int) -> tuple[Any, Vec]:
+    """Return a fresh SX column of ``width`` symbols and the list of its scalars."""
+    import casadi as ca
+
+    column = ca.SX.sym(name, width)
+    return column, ca.vertsplit(column)
+
+
+def _turn(joint: Joint, angle: Scalar) -> list[Vec]:
+    """Rotation about the joint axis: a a^T + cos (I - a a^T) + sin [a]x, identity for prismatic joints."""
+    import casadi as ca
+
+    if joint.prismatic:
+        return _rows(np.eye(3))
+    a = joint.axis
+    outer, cosine, sine = np.outer(a, a), ca.cos(angle), ca.sin(angle)
+    skew = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    rest = np.eye(3) - outer
+    return [[_sum3(outer[i, j], rest[i, j], cosine, skew[i, j], sine) for j in range(3)] for i in range(3)]
+
+
+def _sum3(constant: float, a: float, cosine: Scalar, b: float, sine: Scalar) -> Scalar:
+    total: Scalar = float(constant)
+    for factor, value in ((a, cosine), (b, sine)):
+        if factor != 0.0:
+            term = value * float(factor)
+            total = term if isinstance(total, float) and total == 0.0 else total + term
+    return total
+
+
+def _offset(joint: Joint, angle: Scalar) -> Vec:
+    """Origin of the moved joint frame in the previous frame."""
+    offset = _constants(joint.translation)
+    if joint.prismatic:
+        offset = add(offset, scale(_constants(joint.rotation @ joint.axis), angle))
+    return offset
+
+
+def _constants(values: NDArray[np.float64]) -> Vec:
+    return [float(value) for value in values]
+
+
+def _rows(matrix: NDArray[np.float64]) -> list[Vec]:
+    return [_constants(row) for row in matrix]
+
+
+def _times(matrix: list[Vec], vector: Vec) -> Vec:
+    return [dot(row, vector) for row in matrix]
+
+
+def _transposed_times(matrix: list[Vec], vector: Vec) -> Vec:
+    return [dot([matrix[row][column] for row in range(3)], vector) for column in range(3)]
+
+
+def _product(a: list[Vec], b: list[Vec]) -> list[Vec]:
+    return [[dot(row, [b[k][column] for k in range(3)]) for column in range(3)] for row in a]

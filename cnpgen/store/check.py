@@ -1,0 +1,213 @@
+"""The shallow check of a dataset: every file is there, whole, and what the plan says; no row is computed again."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.errors import DatasetError
+from cnpgen.fields import Field
+from cnpgen.store.files import file_sha256
+from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
+from cnpgen.store.manifest import data_fingerprint, load_manifest
+from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shard_attributes, shards
+from cnpgen.store.record import load_record
+from cnpgen.store.shard import (
+    FORMAT,
+    FORMAT_VERSION,
+    StoredField,
+    field_attributes,
+    read_attributes,
+    read_schema,
+    storage_dtype,
+)
+from cnpgen.store.summary import summarise, unfinished
+
+_LISTED = (PLAN, STATS, CARD, CROISSANT)
+_NOTHING = "(nothing)"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is not as it should be.
+
+    Attributes:
+        file: Path relative to the dataset's folder.
+        problem: What is wrong with it.
+        note: Whether it is only worth knowing: the dataset is good nevertheless.
+    """
+
+    file: str
+    problem: str
+    note: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.problem}"
+
+
+def _silent(_file: str) -> None:
+    """Report nothing."""
+
+
+def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) -> list[Finding]:
+    """Check the files of a dataset against its manifest, its sidecars and its plan.
+
+    Args:
+        folder: The dataset's folder.
+        progress: Called with the name of every shard before it is checked.
+
+    Returns:
+        What is wrong, by file; nothing if all is well. A dataset without manifest is checked as far as it goes.
+
+    Raises:
+        MachineError: The system would not let us read something.
+    """
+    try:
+        plan = load_plan(folder)
+    except DatasetError as error:
+        return [Finding(PLAN, _reason(error, folder))]
+    findings, manifest = _check_manifest(folder, plan)
+    entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
+    for task in shards(plan):
+        entry = entries.get(task.file)
+        if finished or (folder / task.sidecar).exists():
+            progress(task.file)
+            findings += check_shard(folder, plan, task, entry)
+    return findings + list(_extras(folder, plan))
+
+
+def _reason(error: DatasetError, folder: Path) -> str:
+    """Return an error's message without the folder, which the caller knows."""
+    return str(error).replace(f"{folder}/", "")
+
+
+def _check_manifest(folder: Path, plan: DatasetPlan) -> tuple[list[Finding], dict[str, Any]]:
+    """Check the manifest and the files it lists; return it empty if it cannot be relied upon."""
+    if not (folder / MANIFEST).exists():
+        summary = summarise(folder, plan, allow_partial=True)
+        return [Finding(MANIFEST, f"missing: the dataset is {unfinished(summary)}")], {}
+    try:
+        manifest = load_manifest(folder)
+    except DatasetError as error:
+        return [Finding(MANIFEST, _reason(error, folder))], {}
+    if manifest["plan_fingerprint"] != plan.fingerprint:
+        return [Finding(MANIFEST, "is of another plan than plan.json")], {}
+    entries = _shard_entries(manifest)
+    findings = (
+        [] if entries.keys() == {task.file for task in shards(plan)} else [Finding(MANIFEST, "lists other shards")]
+    )
+    if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
+        findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists"))
+    for name in _LISTED:
+        findings += _check_digest(folder, name, manifest["files"][name]["sha256"])
+    return findings, manifest
+
+
+def _shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {entry["file"]: entry for split in manifest.get("splits", {}).values() for entry in split["shards"]}
+
+
+def _check_digest(folder: Path, name: str, sha256: str) -> list[Finding]:
+    """Compare a file with its recorded digest."""
+    if not (folder / name).is_file():
+        return [Finding(name, "is missing")]
+    if file_sha256(folder / name) != sha256:
+        return [Finding(name, "was changed: its sha256 is not the recorded one")]
+    return []
+
+
+def check_shard(folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[str, Any] | None = None) -> list[Finding]:
+    """Check one shard and its sidecar.
+
+    Args:
+        folder: The dataset's folder.
+        plan: Its plan.
+        task: Which shard.
+        entry: What the manifest says about it, if there is one.
+
+    Returns:
+        What is wrong.
+
+    Raises:
+        MachineError: The system would not let us read it.
+    """
+    findings, expected = _check_sidecar(folder, plan, task, entry)
+    if not (folder / task.file).is_file():
+        return [*findings, Finding(task.file, "is missing")]
+    size, sha256 = expected
+    found = (folder / task.file).stat().st_size
+    if size is not None and found != size:
+        findings.append(Finding(task.file, f"has {found} bytes instead of {size}"))
+    elif sha256 is not None:
+        findings += _check_digest(folder, task.file, sha256)
+    return findings + _check_content(folder, plan, task)
+
+
+def _check_sidecar(
+    folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[str, Any] | None
+) -> tuple[list[Finding], tuple[int | None, str | None]]:
+    """Check a sidecar; return also the size and digest that the shard should have, as far as somebody knows."""
+    expected = (None, None) if entry is None else (entry["bytes"], entry["sha256"])
+    try:
+        record = load_record(folder, task)
+    except DatasetError as error:
+        return [Finding(task.sidecar, _reason(error, folder))], expected
+    findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
+    if record.plan_fingerprint != plan.fingerprint:
+        findings.append(Finding(task.sidecar, f"belongs to another plan ({record.plan_fingerprint[:12]}...)"))
+    return findings, expected if entry is not None else (record.bytes, record.sha256)
+
+
+def _check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Finding]:
+    """Compare what a shard says about itself with the plan."""
+    path = folder / task.file
+    try:
+        attributes, schema = read_attributes(path), read_schema(path)
+    except DatasetError as error:
+        return [Finding(task.file, _reason(error, folder))]
+    expected = {"format": FORMAT, "format_version": FORMAT_VERSION, **shard_attributes(plan, task)}
+    problems = [
+        f"its {name} is {attributes.get(name)!r}, the plan says {value!r}"
+        for name, value in expected.items()
+        if attributes.get(name) != value
+    ]
+    names = {field.name for field in plan.fields}
+    problems += [f"lacks the field {name!r}" for name in sorted(names - schema.keys())]
+    problems += [f"has an unknown field {name!r}" for name in sorted(schema.keys() - names)]
+    for field in plan.fields:
+        if field.name in schema:
+            problems += _check_field(field, schema[field.name], plan, task)
+    return [Finding(task.file, problem) for problem in problems]
+
+
+def _check_field(field: Field, found: StoredField, plan: DatasetPlan, task: ShardTask) -> list[str]:
+    """Compare what a shard says about a field with the plan."""
+    shape = (task.rows, field.width) if field.width else (task.rows,)
+    dtype = storage_dtype(field, plan.dtype)
+    problems = []
+    if found.shape != shape or found.dtype != dtype:
+        problems.append(f"field {field.name!r} is {found.dtype} of shape {found.shape}, not {dtype} of shape {shape}")
+    expected = field_attributes(field)
+    pairs = {
+        name: (found.attributes.get(name, _NOTHING), expected.get(name, _NOTHING))
+        for name in expected | found.attributes
+    }
+    return problems + [
+        f"field {field.name!r} has {name} {has!r}, the plan says {planned!r}"
+        for name, (has, planned) in pairs.items()
+        if not np.array_equal(has, planned)
+    ]
+
+
+def _extras(folder: Path, plan: DatasetPlan) -> Iterator[Finding]:
+    """Name what does not belong to the dataset, a foreign folder as a whole."""
+    known = {PLAN, MANIFEST, *_LISTED, WORK, *plan.splits}
+    for task in shards(plan):
+        known |= {task.file, task.sidecar}
+    for parent in [folder, *(folder / split for split in plan.splits)]:
+        for item in sorted(parent.iterdir()) if parent.is_dir() else ():
+            name = item.relative_to(folder).as_posix()
+            if name not in known:
+                yield Finding(name, "is not part of the dataset", note=True)

@@ -1,0 +1,91 @@
+"""The Croissant description of a dataset: metadata and files only.
+
+No record set is promised: no reader of Croissant opens HDF5 (mlcommons/croissant issue 697).
+"""
+
+from typing import Any
+
+from cnpgen.store.summary import Summary
+
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+
+
+def croissant_document(summary: Summary, *, created: str, citation: str) -> dict[str, Any]:
+    """Return the content of ``croissant.json``.
+
+    Args:
+        summary: The finished shards.
+        created: When the dataset was finished, ISO 8601.
+        citation: How to cite it.
+    """
+    plan = summary.plan
+    document: dict[str, Any] = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": plan.name,
+        "description": _description(summary),
+        "version": plan.version,
+        "datePublished": created,
+    }
+    if plan.license:
+        document["license"] = f"https://spdx.org/licenses/{plan.license}"
+    if citation:
+        document["citeAs"] = citation
+    return document | {"distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records]}
+
+
+def _description(summary: Summary) -> str:
+    """Say in prose what the record sets would have said."""
+    plan = summary.plan
+    rows = ", ".join(f"{count} {split}" for split, count in plan.splits.items())
+    fields = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in plan.fields)
+    title = plan.title.rstrip(".") or plan.name
+    return f"{title}. Rows: {rows}. Every HDF5 file holds one dataset per field, one entry per row: {fields}."
+
+
+def _file(name: str, size: int, sha256: str) -> dict[str, str]:
+    return {
+        "@type": "cr:FileObject",
+        "@id": name,
+        "name": name,
+        "contentUrl": name,
+        "contentSize": f"{size} B",
+        "encodingFormat": "application/x-hdf5",
+        "sha256": sha256,
+    }

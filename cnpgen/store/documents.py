@@ -1,0 +1,118 @@
+"""Sealed JSON documents: readable, identical from run to run, and any changed byte is noticed when they are read.
+
+The last key of a document, ``self_sha256``, is the sha256 of the file's own text with 64 zeros in its place.
+"""
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.files import read_file, write_file
+
+_BLANK = "0" * 64
+_SEAL = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
+
+
+def plain(value: Any) -> Any:
+    """Reduce a value to JSON's types: tuples and arrays become lists, infinities the strings ``float()`` reads.
+
+    Raises:
+        TypeError: Something has no JSON form.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"no JSON form for {type(value).__name__} {value!r}")
+
+
+def canonical_sha256(value: Any) -> str:
+    """Compute the sha256 of a value's compact JSON with sorted keys: equal values, equal digits."""
+    text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def render(value: Any, indent: str = "") -> str:
+    """Lay out plain JSON with two spaces per level and lists of scalars on one line each."""
+    inner = indent + "  "
+    if isinstance(value, dict) and value:
+        items = [f"{json.dumps(key, ensure_ascii=False)}: {render(item, inner)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(inner + item for item in items) + "\n" + indent + "}"
+    if isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
+        return "[\n" + ",\n".join(inner + render(item, inner) for item in value) + "\n" + indent + "]"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None = None) -> None:
+    """Seal a document and write it atomically.
+
+    Args:
+        path: Where to.
+        document: JSON-able content with the keys "format" and "format_version" first.
+        work: Folder for the temporary file.
+
+    Raises:
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    write_file(path, _SEAL.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
+
+
+def load_document(path: Path, kind: str, *, version: int) -> dict[str, Any]:
+    """Read a sealed document.
+
+    Args:
+        path: The file.
+        kind: The "format" that it must have.
+        version: The newest "format_version" that the caller understands.
+
+    Returns:
+        Its content without the seal.
+
+    Raises:
+        DatasetError: It is missing, cut off, changed since it was written, of another kind or from a newer cnpgen.
+        MachineError: The system would not let us read it.
+    """
+    text, document = _parse(path)
+    if document.get("format") != kind:
+        raise DatasetError(f"{path} is not a {kind} file: its format is {document.get('format')!r}")
+    found = document.get("format_version")
+    if isinstance(found, int) and found > version:
+        raise DatasetError(f"{path} has format version {found}, this cnpgen reads up to {version}: upgrade cnpgen")
+    seal = _SEAL.search(text)
+    blank = _SEAL.sub(f'"self_sha256": "{_BLANK}"\n}}\n', text)
+    if found is None or seal is None or seal[1] != hashlib.sha256(blank.encode()).hexdigest():
+        raise DatasetError(f"{path} is damaged: it was changed after it was written")
+    del document["self_sha256"]
+    return document
+
+
+def _parse(path: Path) -> tuple[str, dict[str, Any]]:
+    """Return a JSON object's text and content."""
+    content = read_file(path)
+    if not content:
+        raise DatasetError(f"{path} is damaged: it is empty")
+    try:
+        text = content.decode()
+        document = json.loads(text)
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: not JSON ({error})") from error
+    if not isinstance(document, dict):
+        raise DatasetError(f"{path} is damaged: a JSON object was expected")
+    return text, document

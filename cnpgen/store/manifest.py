@@ -1,0 +1,165 @@
+"""The manifest of a dataset: written last, so that its existence means that the dataset is complete."""
+
+import hashlib
+import os
+import time
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import UsageError
+from cnpgen.fields import Field
+from cnpgen.store.card import card_text
+from cnpgen.store.croissant import croissant_document
+from cnpgen.store.documents import load_document, plain, render, save_document
+from cnpgen.store.files import file_sha256, sweep, write_file
+from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
+from cnpgen.store.plan import DatasetPlan, load_plan
+from cnpgen.store.summary import Summary, stats_document, summarise
+
+FORMAT = "cnpgen-dataset"
+FORMAT_VERSION = 1
+
+
+def finalize(folder: Path, *, notes: str = "", citation: str = "") -> dict[str, Any]:
+    """Sum up the shards of a dataset: statistics, card, Croissant and, last, the manifest.
+
+    Args:
+        folder: The dataset's folder.
+        notes: Text about the dataset to include in its card, Markdown.
+        citation: How to cite the dataset.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        DatasetError: Shards are missing, damaged or of another plan; the message says which.
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    work = folder / WORK
+    created = _now()
+    summary = summarise(folder, load_plan(folder))
+    (folder / MANIFEST).unlink(missing_ok=True)
+    save_document(folder / STATS, stats_document(summary), work=work)
+    write_file(folder / CARD, card_text(summary, folder=folder.resolve().name, notes=notes), work=work)
+    croissant = plain(croissant_document(summary, created=created, citation=citation))
+    write_file(folder / CROISSANT, render(croissant) + "\n", work=work)
+    save_document(folder / MANIFEST, _manifest(folder, summary, created=created, citation=citation), work=work)
+    sweep(work)
+    return load_manifest(folder)
+
+
+def load_manifest(folder: Path) -> dict[str, Any]:
+    """Read ``manifest.json``.
+
+    Raises:
+        DatasetError: It is missing (the dataset is unfinished), damaged or written by a newer cnpgen.
+        MachineError: The system would not let us read it.
+    """
+    return load_document(folder / MANIFEST, FORMAT, version=FORMAT_VERSION)
+
+
+def _now() -> str:
+    """Return the time in UTC, or what SOURCE_DATE_EPOCH says, as ISO 8601 to the second."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    try:
+        seconds = int(epoch) if epoch else int(time.time())
+        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    except (ValueError, OverflowError, OSError) as error:
+        raise UsageError(f"SOURCE_DATE_EPOCH must be a number of seconds since 1970, got {epoch!r}") from error
+
+
+def _manifest(folder: Path, summary: Summary, *, created: str, citation: str) -> dict[str, Any]:
+    """Build the manifest; the files that it lists must be on the disk."""
+    plan = summary.plan
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "name": plan.name,
+        "version": plan.version,
+        "title": plan.title,
+        "created": created,
+        "license": plan.license,
+        "citation": citation,
+        "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
+        "plan_fingerprint": plan.fingerprint,
+        **_origin(summary),
+        "features": {field.name: _feature(field, plan) for field in plan.fields},
+        "yield": summary.outcome.yield_json(),
+        "verification": dict(summary.outcome.verification),
+        "splits": {split: _split(folder, summary, split) for split in plan.splits},
+        "stats": STATS,
+        "files": {name: _listed(folder / name) for name in (PLAN, STATS, CARD, CROISSANT)},
+    }
+
+
+def data_fingerprint(shards: Iterable[tuple[str, str]]) -> str:
+    """Compute the fingerprint of a dataset's rows, as ``sha256sum */shard-*.h5 | sha256sum`` in its folder does.
+
+    Args:
+        shards: Path and sha256 of every shard.
+    """
+    lines = "".join(f"{sha256}  {file}\n" for file, sha256 in sorted(shards))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def _origin(summary: Summary) -> dict[str, Any]:
+    """Say where the rows come from; "environments" are the versions that made them, more than one after an upgrade."""
+    plan = summary.plan
+    environments: list[dict[str, str]] = []
+    for _, record in summary.records:
+        if (versions := dict(record.versions)) not in environments:
+            environments.append(versions)
+    pipeline = plan.recipe.get("pipeline")
+    return {
+        "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
+        "recipe_sha256": plan.recipe_sha256,
+        "recipe": plan.recipe,
+        "seed": str(plan.seed),
+        "generator": plan.generator,
+        "backend": plan.backend,
+        "dtype": plan.dtype,
+        "block_rows": plan.block_rows,
+        "shard_size": plan.shard_size,
+        "robot": plan.robot,
+        "versions": plan.versions,
+        "environments": environments,
+        "seconds": sum(record.seconds for _, record in summary.records),
+    }
+
+
+def _feature(field: Field, plan: DatasetPlan) -> dict[str, Any]:
+    """Describe a field with the keys of LeRobot's ``info.json`` and the units that those lack."""
+    return {
+        "dtype": plan.dtype if field.dtype == "float" else field.dtype,
+        "shape": [field.width] if field.width else [],
+        "names": field.names,
+        "units": field.unit,
+        "long_name": field.long_name,
+        "role": field.role,
+        "frame": field.frame,
+        "valid_min": field.valid_min,
+        "valid_max": field.valid_max,
+    }
+
+
+def _split(folder: Path, summary: Summary, split: str) -> dict[str, Any]:
+    """List the shards of a split."""
+    entries = [
+        {
+            "file": record.file,
+            "rows": record.rows,
+            "first_sample_id": record.first_sample_id,
+            "bytes": record.bytes,
+            "sha256": record.sha256,
+            "sidecar": {"file": task.sidecar, "sha256": file_sha256(folder / task.sidecar)},
+        }
+        for task, record in summary.of_split(split)
+    ]
+    outcome = summary.outcomes[split]
+    return {"rows": summary.plan.splits[split], "yield": outcome.yield_json(), "shards": entries}
+
+
+def _listed(path: Path) -> dict[str, Any]:
+    return {"bytes": path.stat().st_size, "sha256": file_sha256(path)}

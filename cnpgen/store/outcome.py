@@ -1,0 +1,141 @@
+"""What happened to the draws of a shard: how many were tried and accepted, why the others were not, and where."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError
+
+
+@dataclass(frozen=True, eq=False)
+class DensityMap:
+    """Where in a plane draws fell and where they survived.
+
+    Attributes:
+        x: Extent along the first axis [m].
+        y: Extent along the second axis [m].
+        drawn: Draws per cell, shape (nx, ny), first index along x.
+        accepted: Accepted draws per cell, shape (nx, ny).
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    drawn: NDArray[np.int64]
+    accepted: NDArray[np.int64]
+
+    def merge(self, other: "DensityMap") -> "DensityMap":
+        """Add the counts of two maps of the same grid.
+
+        Raises:
+            DatasetError: The grids differ.
+        """
+        if (self.x, self.y, self.drawn.shape) != (other.x, other.y, other.drawn.shape):
+            raise DatasetError("density maps with different grids cannot be merged")
+        return DensityMap(self.x, self.y, self.drawn + other.drawn, self.accepted + other.accepted)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """The fates of all draws: ``tried == accepted + sum(rejections)``.
+
+    Attributes:
+        tried: Number of draws.
+        accepted: Draws that passed every stage.
+        rejections: Reason -> number of draws, in pipeline order.
+        densities: Name -> map.
+        verification: Constraint -> worst violation among the stored rows, in the constraint's unit.
+    """
+
+    tried: int
+    accepted: int
+    rejections: Mapping[str, int] = field(default_factory=dict)
+    densities: Mapping[str, DensityMap] = field(default_factory=dict)
+    verification: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        rejected = sum(self.rejections.values())
+        if self.tried != self.accepted + rejected:
+            raise DatasetError(f"{self.tried} draws, but {self.accepted} accepted and {rejected} rejected ones")
+        for name, worst in self.verification.items():
+            if not math.isfinite(worst):
+                raise DatasetError(f"the worst violation of {name!r} must be a finite number, got {worst}")
+
+    def merge(self, other: "Outcome") -> "Outcome":
+        """Return the outcome of both sets of draws: counts add up, the worst violation stays."""
+        reasons = _merged_order(list(self.rejections), list(other.rejections))
+        densities = dict(self.densities)
+        for name, density in other.densities.items():
+            densities[name] = densities[name].merge(density) if name in densities else density
+        worst = dict(self.verification)
+        for name, value in other.verification.items():
+            worst[name] = max(worst.get(name, value), value)
+        return Outcome(
+            tried=self.tried + other.tried,
+            accepted=self.accepted + other.accepted,
+            rejections={name: self.rejections.get(name, 0) + other.rejections.get(name, 0) for name in reasons},
+            densities=densities,
+            verification=worst,
+        )
+
+    def yield_json(self) -> dict[str, Any]:
+        """Return tried, accepted and rejections as a JSON-able dict."""
+        return {"tried": self.tried, "accepted": self.accepted, "rejections": dict(self.rejections)}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as a JSON-able dict."""
+        return {
+            **self.yield_json(),
+            "verification": dict(self.verification),
+            "densities": densities_to_json(self.densities),
+        }
+
+
+def _merged_order(first: Sequence[str], second: Sequence[str]) -> list[str]:
+    """Merge two orders of reasons: one that only the second has follows the one that it follows there."""
+    merged = list(first)
+    for position, reason in enumerate(second):
+        if reason not in merged:
+            merged.insert(merged.index(second[position - 1]) + 1 if position else 0, reason)
+    return merged
+
+
+def densities_to_json(densities: Mapping[str, DensityMap]) -> dict[str, Any]:
+    """Return density maps as a JSON-able dict."""
+    return {
+        name: {"x": list(item.x), "y": list(item.y), "drawn": item.drawn.tolist(), "accepted": item.accepted.tolist()}
+        for name, item in densities.items()
+    }
+
+
+def densities_from_json(content: Mapping[str, Any]) -> dict[str, DensityMap]:
+    """Rebuild density maps from their JSON form."""
+    return {name: _density(item) for name, item in content.items()}
+
+
+def _density(content: Mapping[str, Any]) -> DensityMap:
+    (x_low, x_high), (y_low, y_high) = content["x"], content["y"]
+    counts = [np.array(content[key], np.int64) for key in ("drawn", "accepted")]
+    return DensityMap((float(x_low), float(x_high)), (float(y_low), float(y_high)), *counts)
+
+
+def outcome_from_json(content: Mapping[str, Any]) -> Outcome:
+    """Rebuild an outcome from its JSON form."""
+    return Outcome(
+        tried=int(content["tried"]),
+        accepted=int(content["accepted"]),
+        rejections={name: int(count) for name, count in content["rejections"].items()},
+        densities=densities_from_json(content["densities"]),
+        verification={name: float(value) for name, value in content["verification"].items()},
+    )
+
+
+def merge_outcomes(parts: Sequence[Outcome]) -> Outcome:
+    """Merge the outcomes of shards, in the given order; without any, nothing was tried."""
+    merged = Outcome(tried=0, accepted=0)
+    for part in parts:
+        merged = merged.merge(part)
+    return merged

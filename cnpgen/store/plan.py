@@ -1,0 +1,232 @@
+"""The plan of a dataset: everything that determines its bytes, written before the first shard and never changed."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError, UsageError, nearest
+from cnpgen.fields import Field
+from cnpgen.store.documents import canonical_sha256, load_document, plain, save_document
+from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
+
+FORMAT = "cnpgen-plan"
+FORMAT_VERSION = 1
+_INFORMATIONAL = ("title", "license", "versions")
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One shard that is to be made.
+
+    Attributes:
+        split: Name of the split.
+        index: Number of the shard within the split.
+        first_row: Index of its first row within the split.
+        rows: Number of rows.
+    """
+
+    split: str
+    index: int
+    first_row: int
+    rows: int
+
+    @property
+    def file(self) -> str:
+        """Path of the shard, relative to the dataset's folder."""
+        return shard_stem(self.split, self.index) + ".h5"
+
+    @property
+    def sidecar(self) -> str:
+        """Path of the shard's commit record, relative to the dataset's folder."""
+        return shard_stem(self.split, self.index) + ".json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetPlan:
+    """What a dataset will hold.
+
+    Attributes:
+        name: Name of the dataset.
+        version: Its version, MAJOR.MINOR.PATCH.
+        title: One line about it.
+        license: Licence of the rows, an SPDX identifier.
+        recipe_sha256: Digest of the resolved recipe.
+        recipe: The resolved recipe as nested tables.
+        seed: Root seed.
+        splits: Split name -> rows.
+        shard_size: Rows per shard, a multiple of ``block_rows``; the last shard of a split may be shorter.
+        block_rows: Rows per block.
+        dtype: Float type of the stored numbers, "float64" or "float32".
+        backend: Which kernels computed them: "compiled", "numpy", ...
+        generator: How random numbers are made.
+        fields: The columns, in order.
+        robot: Name, digest of the URDF, joint names and limits.
+        versions: Versions of cnpgen, Python and libraries when the plan was made; not part of the plan's identity.
+    """
+
+    name: str
+    version: str
+    title: str = ""
+    license: str = ""
+    recipe_sha256: str
+    recipe: Mapping[str, Any]
+    seed: int
+    splits: Mapping[str, int]
+    shard_size: int
+    block_rows: int
+    dtype: str = "float64"
+    backend: str
+    generator: str = "numpy SFC64 seeded by SeedSequence"
+    fields: tuple[Field, ...]
+    robot: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("recipe", "splits", "robot", "versions"):  # as JSON will give them back
+            object.__setattr__(self, name, plain(getattr(self, name)))
+        _check_sizes(self)
+        _check_names(self)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """The sha256 over everything that determines the bytes of the shards."""
+        identity = {key: value for key, value in to_json(self).items() if key not in _INFORMATIONAL}
+        return canonical_sha256(identity)
+
+    def field_named(self, name: str) -> Field:
+        """Return the field called ``name``.
+
+        Raises:
+            DatasetError: There is none.
+        """
+        by_name = {item.name: item for item in self.fields}
+        if name not in by_name:
+            raise DatasetError(f"{self.name} has no field {name!r}{nearest(name, by_name)}")
+        return by_name[name]
+
+
+def _check_sizes(plan: DatasetPlan) -> None:
+    if plan.block_rows < 1 or plan.shard_size < 1 or plan.shard_size % plan.block_rows:
+        raise UsageError(
+            f"the shard size must be a positive multiple of the block size {plan.block_rows}, got {plan.shard_size}"
+        )
+    if plan.seed < 0:
+        raise UsageError(f"the seed must not be negative, got {plan.seed}")
+    if plan.dtype not in {"float64", "float32"}:
+        raise UsageError(f"dtype must be 'float64' or 'float32', got {plan.dtype!r}")
+    if any(rows < 0 for rows in plan.splits.values()) or not any(plan.splits.values()):
+        raise UsageError(f"the splits must have rows, got {dict(plan.splits)}")
+
+
+def _check_names(plan: DatasetPlan) -> None:
+    for split in plan.splits:
+        if not SPLIT_NAME.fullmatch(split):
+            raise UsageError(f"a split is named with letters, digits and '_', starting with a letter; got {split!r}")
+    names = [item.name for item in plan.fields]
+    if not names or len(set(names)) != len(names):
+        raise UsageError(f"the fields must have different names, got {names}")
+
+
+def default_shard_size(rows: int) -> int:
+    """Choose the rows per shard: about 16 shards, but between 8192 and 65536 rows, a power of two.
+
+    Args:
+        rows: Rows of the whole dataset.
+
+    Returns:
+        ``clip(2^round(log2(rows / 16)), 8192, 65536)``.
+    """
+    return min(1 << max(round(math.log2(max(rows, 1) / 16)), 13), 65536)
+
+
+def shards(plan: DatasetPlan) -> list[ShardTask]:
+    """List the shards of a plan, split by split, in order; a split without rows has none."""
+    return [
+        ShardTask(split, index, first, min(plan.shard_size, rows - first))
+        for split, rows in plan.splits.items()
+        for index, first in enumerate(range(0, rows, plan.shard_size))
+    ]
+
+
+def shard_attributes(plan: DatasetPlan, task: ShardTask) -> dict[str, str | int]:
+    """Say what a shard's file says about itself; no time, host or path, so that its bytes depend on the plan alone."""
+    return {
+        "dataset": plan.name,
+        "dataset_version": plan.version,
+        "split": task.split,
+        "shard_index": task.index,
+        "first_sample_id": task.first_row,
+        "rows": task.rows,
+        "recipe_sha256": plan.recipe_sha256,
+        "plan_fingerprint": plan.fingerprint,
+        "root_seed": str(plan.seed),
+        "generator": plan.generator,
+        "backend": plan.backend,
+        "cnpgen_version": plan.versions.get("cnpgen", ""),
+    }
+
+
+def to_json(plan: DatasetPlan) -> dict[str, Any]:
+    """Return the plan as a JSON-able dict."""
+    names = [name for name in DatasetPlan.__dataclass_fields__ if name not in {"fields", "seed"}]
+    content = {"seed": str(plan.seed), "fields": [asdict(item) for item in plan.fields]}
+    return {name: getattr(plan, name) for name in names} | {name: plain(value) for name, value in content.items()}
+
+
+def from_json(content: Mapping[str, Any]) -> DatasetPlan:
+    """Rebuild a plan from :func:`to_json`'s dict.
+
+    Raises:
+        DatasetError: A key is missing or has the wrong type.
+    """
+    try:
+        arguments = {name: content[name] for name in DatasetPlan.__dataclass_fields__}
+        arguments["seed"] = int(content["seed"])
+        arguments["fields"] = tuple(_field(item) for item in content["fields"])
+        return DatasetPlan(**arguments)
+    except (KeyError, TypeError, ValueError, AttributeError, UsageError) as error:
+        raise DatasetError(f"the plan is damaged: {type(error).__name__} {error}") from error
+
+
+def _field(content: Mapping[str, Any]) -> Field:
+    limits = {
+        name: None if content[name] is None else tuple(float(value) for value in content[name])
+        for name in ("valid_min", "valid_max")
+    }
+    return Field(**{**content, "names": tuple(content["names"]), **limits})
+
+
+def save_plan(folder: Path, plan: DatasetPlan) -> None:
+    """Write ``plan.json``; a folder that holds the same plan already is left as it is.
+
+    Raises:
+        DatasetError: The folder holds another dataset, or something else.
+        MachineError: The folder cannot be written.
+    """
+    path = folder / PLAN
+    if path.exists():
+        if load_plan(folder).fingerprint != plan.fingerprint:
+            raise DatasetError(f"{folder} holds another dataset (its plan differs): choose another folder or remove it")
+        return
+    if folder.is_dir() and any(item.name != WORK for item in folder.iterdir()):
+        raise DatasetError(f"{folder} is not empty and holds no dataset: choose another folder or empty it")
+    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "fingerprint": plan.fingerprint}
+    save_document(path, document | to_json(plan), work=folder / WORK)
+
+
+def load_plan(folder: Path) -> DatasetPlan:
+    """Read ``plan.json``.
+
+    Raises:
+        DatasetError: It is missing, damaged or written by a newer cnpgen.
+        MachineError: The system would not let us read it.
+    """
+    path = folder / PLAN
+    document = load_document(path, FORMAT, version=FORMAT_VERSION)
+    plan = from_json(document)
+    if plan.fingerprint != document.get("fingerprint"):
+        raise DatasetError(f"{path} is damaged: its fingerprint does not match its content")
+    return plan

@@ -1,0 +1,125 @@
+"""Reading a dataset's rows back, for inspection and validation."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, nearest
+from cnpgen.store.layout import MANIFEST
+from cnpgen.store.manifest import load_manifest
+from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.record import is_committed
+from cnpgen.store.shard import read_shard, storage_dtype
+from cnpgen.store.summary import summarise, unfinished
+
+
+@dataclass(frozen=True, eq=False)
+class StoredDataset:
+    """A dataset on disk; holds no open files, so it can be pickled and used in any process.
+
+    Attributes:
+        folder: Its folder.
+        plan: Its plan.
+        manifest: Its manifest; None while it is unfinished.
+    """
+
+    folder: Path
+    plan: DatasetPlan
+    manifest: dict[str, Any] | None
+
+    def tasks(self, split: str) -> list[ShardTask]:
+        """List the shards of a split that are there, in order.
+
+        Raises:
+            DatasetError: There is no such split.
+        """
+        if split not in self.plan.splits:
+            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(split, self.plan.splits)}")
+        found = [task for task in shards(self.plan) if task.split == split]
+        if self.manifest is None:
+            return [task for task in found if is_committed(self.folder, task, self.plan.fingerprint)]
+        return found
+
+    def iter_shards(
+        self, split: str, *, fields: Sequence[str] | None = None
+    ) -> Iterator[tuple[ShardTask, dict[str, NDArray[Any]]]]:
+        """Read the shards of a split one by one.
+
+        Args:
+            split: Name of the split.
+            fields: Names of the fields; all by default, in the plan's order.
+
+        Yields:
+            The shard, and field name -> values, shape (rows, width) or (rows,).
+
+        Raises:
+            DatasetError: There is no such split or field, or a shard is damaged.
+        """
+        names = self._names(fields)
+        for task in self.tasks(split):
+            yield task, read_shard(self.folder / task.file, names)
+
+    def read(
+        self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, those of them that are there.
+
+        Args:
+            split: Name of the split.
+            fields: Names of the fields; all by default, in the plan's order.
+            start: First row.
+            stop: Row after the last one; all by default.
+
+        Returns:
+            Field name -> values, shape (rows, width) or (rows,).
+
+        Raises:
+            DatasetError: There is no such split or field, the rows are out of range, or a shard is damaged.
+        """
+        names = self._names(fields)
+        tasks = self.tasks(split)
+        rows = self.plan.splits[split]
+        stop = rows if stop is None else stop
+        if not 0 <= start <= stop <= rows:
+            raise DatasetError(f"split {split!r} has rows 0 to {rows}, got {start} to {stop}")
+        parts: dict[str, list[NDArray[Any]]] = {name: [self._no_rows(name)] for name in names}
+        for task in tasks:
+            low, high = max(start - task.first_row, 0), min(stop - task.first_row, task.rows)
+            if low < high:
+                columns = read_shard(self.folder / task.file, names)
+                for name in names:
+                    parts[name].append(columns[name][low:high])
+        return {name: np.concatenate(items) for name, items in parts.items()}
+
+    def _names(self, fields: Sequence[str] | None) -> list[str]:
+        return [self.plan.field_named(name).name for name in fields] if fields else [f.name for f in self.plan.fields]
+
+    def _no_rows(self, name: str) -> NDArray[Any]:
+        field = self.plan.field_named(name)
+        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.plan.dtype))
+
+
+def open_dataset(folder: Path, *, allow_partial: bool = False) -> StoredDataset:
+    """Open a dataset for reading.
+
+    Args:
+        folder: Its folder.
+        allow_partial: Open it even if it is unfinished.
+
+    Raises:
+        DatasetError: There is no dataset, it is unfinished, or its plan or manifest is damaged.
+        MachineError: The system would not let us read something.
+    """
+    plan = load_plan(folder)
+    if (folder / MANIFEST).exists():
+        manifest = load_manifest(folder)
+        if manifest["plan_fingerprint"] != plan.fingerprint:
+            raise DatasetError(f"{folder / MANIFEST} is of another plan than plan.json: the folder mixes two datasets")
+        return StoredDataset(folder, plan, manifest)
+    if not allow_partial:
+        raise DatasetError(f"{folder} is {unfinished(summarise(folder, plan, allow_partial=True))}")
+    return StoredDataset(folder, plan, None)

@@ -1,0 +1,188 @@
+"""The sidecar of a shard: its commit record, written after the shard itself is safely on the disk."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.documents import load_document, save_document
+from cnpgen.store.files import file_sha256
+from cnpgen.store.layout import WORK
+from cnpgen.store.outcome import Outcome, outcome_from_json
+from cnpgen.store.plan import DatasetPlan, ShardTask, shard_attributes, shards
+from cnpgen.store.shard import write_shard
+from cnpgen.store.statistics import FieldStatistics, column_statistics, statistics_from_json
+
+FORMAT = "cnpgen-shard-record"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShardRecord:
+    """What is known of a finished shard, and how it came about.
+
+    Attributes:
+        file: Path of the shard, relative to the dataset's folder.
+        bytes: Its size.
+        sha256: Its digest.
+        rows: Its rows.
+        first_sample_id: Index of its first row within the split.
+        plan_fingerprint: Fingerprint of the plan it belongs to.
+        statistics: Field name -> statistics of its columns.
+        outcome: Fates of the draws that were made for it.
+        started: When the work on it began, ISO 8601 in UTC.
+        seconds: How long the work took [s].
+        versions: Versions of cnpgen, Python and libraries that made it.
+    """
+
+    file: str
+    bytes: int
+    sha256: str
+    rows: int
+    first_sample_id: int
+    plan_fingerprint: str
+    statistics: Mapping[str, FieldStatistics]
+    outcome: Outcome
+    started: str = ""
+    seconds: float = 0.0
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+_PLAIN = ("file", "bytes", "sha256", "rows", "first_sample_id", "plan_fingerprint", "started", "seconds", "versions")
+
+
+def record_to_json(record: ShardRecord) -> dict[str, Any]:
+    """Return a record as a JSON-able dict."""
+    return {
+        **{name: getattr(record, name) for name in _PLAIN},
+        "outcome": record.outcome.to_json(),
+        "statistics": {name: item.to_json() for name, item in record.statistics.items()},
+    }
+
+
+def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
+    """Rebuild a record from its JSON form.
+
+    Raises:
+        DatasetError: A key is missing or has the wrong type.
+    """
+    try:
+        statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
+        outcome = outcome_from_json(content["outcome"])
+        return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, outcome=outcome)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DatasetError(f"the shard's record is damaged: {type(error).__name__} {error}") from error
+
+
+def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
+    """Write a shard's sidecar; from now on the shard counts as made.
+
+    Raises:
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    document = {"format": FORMAT, "format_version": FORMAT_VERSION, **record_to_json(record)}
+    save_document(folder / task.sidecar, document, work=folder / WORK)
+
+
+def load_record(folder: Path, task: ShardTask) -> ShardRecord:
+    """Read a shard's sidecar.
+
+    Raises:
+        DatasetError: It is missing, damaged, written by a newer cnpgen or of another shard.
+        MachineError: The system would not let us read it.
+    """
+    path = folder / task.sidecar
+    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION))
+    found = (record.file, record.rows, record.first_sample_id)
+    if found != (task.file, task.rows, task.first_row):
+        raise DatasetError(f"{path} is the record of another shard: {found[0]}, {found[1]} rows from row {found[2]}")
+    return record
+
+
+def commit_shard(
+    folder: Path,
+    plan: DatasetPlan,
+    task: ShardTask,
+    *,
+    columns: Mapping[str, NDArray[Any]],
+    outcome: Outcome,
+    started: str = "",
+    seconds: float = 0.0,
+    versions: Mapping[str, str] | None = None,
+) -> ShardRecord:
+    """Write a shard and then its sidecar; doing it twice is harmless.
+
+    Args:
+        folder: The dataset's folder.
+        plan: Its plan.
+        task: Which shard.
+        columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
+        outcome: Fates of the draws that were made for it.
+        started: When the work on it began, ISO 8601 in UTC.
+        seconds: How long the work took [s].
+        versions: Versions of cnpgen, Python and libraries that made it.
+
+    Returns:
+        The shard's record.
+
+    Raises:
+        DatasetError: The columns are not what the plan says, or not finite.
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    path = folder / task.file
+    size = write_shard(path, columns, plan.fields, shard_attributes(plan, task), dtype=plan.dtype, work=folder / WORK)
+    record = ShardRecord(
+        file=task.file,
+        bytes=size,
+        sha256=file_sha256(path),
+        rows=task.rows,
+        first_sample_id=task.first_row,
+        plan_fingerprint=plan.fingerprint,
+        statistics=column_statistics(columns, plan.fields),
+        outcome=outcome,
+        started=started,
+        seconds=seconds,
+        versions=versions or {},
+    )
+    save_record(folder, task, record)
+    return record
+
+
+def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardRecord:
+    """Read a shard's sidecar and make sure that it stands for a shard of this plan; the shard's content is not read.
+
+    Args:
+        folder: The dataset's folder.
+        task: Which shard.
+        fingerprint: The plan's fingerprint.
+
+    Raises:
+        DatasetError: The sidecar is missing, damaged or of another plan, or the shard is missing or has another size.
+        MachineError: The system would not let us read it.
+    """
+    record = load_record(folder, task)
+    if record.plan_fingerprint != fingerprint:
+        raise DatasetError(f"{folder / task.sidecar} belongs to another plan ({record.plan_fingerprint[:12]}...)")
+    path = folder / task.file
+    size = path.stat().st_size if path.is_file() else None
+    if size != record.bytes:
+        found = "it is missing" if size is None else f"it has {size} bytes instead of {record.bytes}"
+        raise DatasetError(f"{path} is not the recorded file: {found}")
+    return record
+
+
+def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
+    """Whether a shard is made: its sidecar is whole and of this plan, and its file has the recorded size."""
+    try:
+        load_committed(folder, task, fingerprint)
+    except DatasetError:
+        return False
+    return True
+
+
+def pending(folder: Path, plan: DatasetPlan) -> list[ShardTask]:
+    """List the shards that are still to be made, in order."""
+    return [task for task in shards(plan) if not is_committed(folder, task, plan.fingerprint)]

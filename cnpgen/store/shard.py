@@ -1,0 +1,221 @@
+"""One shard: an HDF5 file with one contiguous dataset per field and attributes that say what the numbers are.
+
+The bytes of a shard depend on its rows, fields and attributes only, within one version of HDF5: no time, host or path.
+"""
+
+import errno
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, nearest
+from cnpgen.fields import Field
+from cnpgen.store.files import committing, machine_error
+
+FORMAT = "cnpgen-shard"
+FORMAT_VERSION = 1
+_STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
+_SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
+
+
+def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
+    """Return the little-endian type that a field is stored in.
+
+    Args:
+        field: The field.
+        dtype: The dataset's float type, "float64" or "float32".
+
+    Raises:
+        DatasetError: There is no such type.
+    """
+    name = dtype if field.dtype == "float" else field.dtype
+    if name not in _STORAGE:
+        raise DatasetError(f"field {field.name!r} cannot be stored as {name!r}, only as one of {', '.join(_STORAGE)}")
+    return np.dtype(_STORAGE[name])
+
+
+def field_attributes(field: Field) -> dict[str, Any]:
+    """Say what the numbers of a field are; arrays have shape (max(width, 1),)."""
+    attributes: dict[str, Any] = {
+        "units": field.unit,
+        "long_name": field.long_name,
+        "names": json.dumps(list(field.names)),
+        "frame": field.frame,
+        "role": field.role,
+    }
+    limits = {"valid_min": field.valid_min, "valid_max": field.valid_max}
+    return attributes | {name: np.array(limit, "<f8") for name, limit in limits.items() if limit is not None}
+
+
+def write_shard(
+    path: Path,
+    columns: Mapping[str, NDArray[Any]],
+    fields: Sequence[Field],
+    attributes: Mapping[str, str | int],
+    *,
+    dtype: str = "float64",
+    work: Path | None = None,
+) -> int:
+    """Write a shard atomically; it is read back before it gets its name.
+
+    Args:
+        path: Where to.
+        columns: Field name -> finite values, shape (rows, width) or (rows,), already in the type they are stored in.
+        fields: The fields, in order; every one must have a column.
+        attributes: File attributes; "rows" must be the number of rows.
+        dtype: The dataset's float type, "float64" or "float32".
+        work: Folder for the temporary file.
+
+    Returns:
+        Number of bytes written.
+
+    Raises:
+        DatasetError: The columns are not what the fields say, or not finite.
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    rows = int(attributes["rows"])
+    _check_columns(columns, fields, rows, dtype)
+    content = _encode(columns, fields, attributes, dtype)
+    with committing(path, work) as temporary:
+        temporary.write_bytes(content)
+        shapes = {name: info.shape for name, info in read_schema(temporary).items()}
+        if shapes != {field.name: _shape(field, rows) for field in fields}:
+            raise DatasetError(f"{path} was not written as it was meant: found {shapes}")
+    return len(content)
+
+
+def _shape(field: Field, rows: int) -> tuple[int, ...]:
+    return (rows, field.width) if field.width else (rows,)
+
+
+def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], rows: int, dtype: str) -> None:
+    """Refuse columns that do not fit the fields."""
+    names = {field.name for field in fields}
+    if columns.keys() != names or rows < 1:
+        missing, extra = sorted(names - columns.keys()), sorted(columns.keys() - names)
+        raise DatasetError(f"a shard needs rows and every field: {rows} rows, missing {missing}, unknown {extra}")
+    for field in fields:
+        values, shape, stored = columns[field.name], _shape(field, rows), storage_dtype(field, dtype)
+        if values.shape != shape or values.dtype != stored:
+            found = f"{values.dtype} of shape {values.shape}"
+            raise DatasetError(f"field {field.name!r} must be {stored} of shape {shape}, got {found}")
+        bad = ~np.isfinite(values).reshape(rows, -1).all(axis=1)
+        if bad.any():
+            raise DatasetError(f"field {field.name!r} is not finite in {bad.sum()} rows, first in row {bad.argmax()}")
+
+
+def _encode(
+    columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], attributes: Mapping[str, str | int], dtype: str
+) -> memoryview:
+    """Build the file in memory, where a full disk cannot leave half of it and errors are the system's own."""
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(_create(buffer)) as file:
+        for field in fields:
+            stored = storage_dtype(field, dtype)
+            dataset = file.create_dataset(field.name, data=columns[field.name], dtype=stored, track_times=False)
+            dataset.attrs.update(field_attributes(field))
+        file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSION, **attributes})
+    return buffer.getbuffer()
+
+
+def _create(buffer: io.BytesIO) -> Any:
+    """Create an HDF5 file in ``buffer``.
+
+    The file format is pinned. The root group stores no times, which ``h5py.File`` has only lately learnt to leave out.
+    Datasets start at multiples of 64 bytes, so that they can be mapped into memory as aligned arrays.
+    """
+    from h5py import h5f, h5fd, h5p
+
+    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
+    creation.set_obj_track_times(False)
+    access.set_fileobj_driver(h5fd.fileobj_driver, buffer)
+    access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
+    access.set_alignment(512, 64)
+    return h5f.create(b"shard", h5f.ACC_TRUNC, creation, access)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a shard for reading, without handles that outlive the block and could be shared by processes."""
+    import h5py
+
+    if not path.is_file():
+        raise DatasetError(f"{path} is missing")
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            yield file
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
+        if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
+            raise machine_error("read", path, error) from error
+        raise DatasetError(f"{path} is damaged or cut off: {error}") from error
+
+
+def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read whole fields of a shard.
+
+    Args:
+        path: The shard.
+        fields: Names of the fields; all by default.
+
+    Returns:
+        Field name -> values, shape (rows, width) or (rows,).
+
+    Raises:
+        DatasetError: The file is missing, damaged or cut off, or has no such field.
+        MachineError: The system would not let us read it.
+    """
+    with _opened(path) as file:
+        known = list(file)
+        for name in fields or ():
+            if name not in known:
+                raise DatasetError(f"{path} has no field {name!r}{nearest(name, known)}")
+        return {name: file[name][()] for name in (known if fields is None else fields)}
+
+
+def read_attributes(path: Path) -> dict[str, str | int]:
+    """Read a shard's file attributes.
+
+    Raises:
+        DatasetError: The file is missing, damaged or cut off.
+        MachineError: The system would not let us read it.
+    """
+    with _opened(path) as file:
+        return {name: value if isinstance(value, str) else int(value) for name, value in file.attrs.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class StoredField:
+    """What a shard says about one of its datasets.
+
+    Attributes:
+        shape: Shape of the dataset; empty for what is no dataset.
+        dtype: Its stored type.
+        attributes: Its attributes.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any] | None
+    attributes: dict[str, Any]
+
+
+def read_schema(path: Path) -> dict[str, StoredField]:
+    """Read what a shard says about its datasets, without their values.
+
+    Raises:
+        DatasetError: The file is missing, damaged or cut off.
+        MachineError: The system would not let us read it.
+    """
+    with _opened(path) as file:
+        return {
+            name: StoredField(getattr(item, "shape", ()), getattr(item, "dtype", None), dict(item.attrs))
+            for name, item in file.items()
+        }

@@ -1,0 +1,173 @@
+"""Statistics of a field that can be merged shard by shard, without ever averaging a quantile."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError
+from cnpgen.fields import Field
+
+Floats = NDArray[np.float64]
+N_BINS = 64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FieldStatistics:
+    """Statistics of the c columns of one field, in the field's unit; c is 1 for a scalar field.
+
+    Counts, extremes and histograms do not depend on how the rows were sharded; mean and m2 only in their last digits.
+
+    Attributes:
+        count: Number of rows.
+        mean: Mean, shape (c,).
+        m2: Sum of squared deviations from the mean, shape (c,).
+        minimum: Smallest value, shape (c,).
+        maximum: Largest value, shape (c,).
+        low: Lower ends of the histograms, the field's ``valid_min``, shape (c,); None without histograms.
+        high: Upper ends, the field's ``valid_max``, shape (c,).
+        histogram: Rows per bin, 64 equal bins from ``low`` to ``high``, shape (c, 64). What lies outside
+            (a value at its limit, but for rounding) counts in the first or last bin.
+    """
+
+    count: int
+    mean: Floats
+    m2: Floats
+    minimum: Floats
+    maximum: Floats
+    low: Floats | None = None
+    high: Floats | None = None
+    histogram: NDArray[np.int64] | None = None
+
+    @property
+    def constant(self) -> NDArray[np.bool_]:
+        """Columns with one value in all rows: dividing by their deviation would make NaN, shape (c,)."""
+        return np.equal(self.minimum, self.maximum)
+
+    @property
+    def std(self) -> Floats:
+        """Standard deviation of these rows, m2 / count under the root, exactly 0 for constant columns, shape (c,)."""
+        return np.where(self.constant, 0.0, np.sqrt(self.m2 / self.count))
+
+    def merge(self, other: "FieldStatistics") -> "FieldStatistics":
+        """Return the statistics of both sets of rows together (Chan, Golub, LeVeque 1979).
+
+        Raises:
+            DatasetError: The two have different columns or histogram ranges.
+        """
+        if not _alike(self, other):
+            raise DatasetError("statistics of different fields cannot be merged")
+        count = self.count + other.count
+        delta = other.mean - self.mean
+        histogram = None
+        if self.histogram is not None and other.histogram is not None:
+            histogram = self.histogram + other.histogram
+        return FieldStatistics(
+            count=count,
+            mean=self.mean + delta * (other.count / count),
+            m2=self.m2 + other.m2 + delta**2 * (self.count * other.count / count),
+            minimum=np.minimum(self.minimum, other.minimum),
+            maximum=np.maximum(self.maximum, other.maximum),
+            low=self.low,
+            high=self.high,
+            histogram=histogram,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON-able dict, with the derived ``std`` and ``constant`` for readers."""
+        content: dict[str, Any] = {"count": self.count}
+        for name in ("mean", "std", "m2", "minimum", "maximum", "constant"):
+            content[{"minimum": "min", "maximum": "max"}.get(name, name)] = getattr(self, name).tolist()
+        if self.histogram is not None and self.low is not None and self.high is not None:
+            counts = self.histogram.tolist()
+            content["histogram"] = {"low": self.low.tolist(), "high": self.high.tolist(), "counts": counts}
+        return content
+
+
+def _alike(a: FieldStatistics, b: FieldStatistics) -> bool:
+    """Whether two statistics are of the same columns."""
+    if a.mean.shape != b.mean.shape or (a.histogram is None) != (b.histogram is None):
+        return False
+    if a.low is None or b.low is None or a.high is None or b.high is None:
+        return True
+    return np.array_equal(a.low, b.low) and np.array_equal(a.high, b.high)
+
+
+def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
+    """Rebuild statistics from their JSON form."""
+    arrays = {name: np.array(content[name], np.float64) for name in ("mean", "m2")}
+    arrays |= {name + "imum": np.array(content[name], np.float64) for name in ("min", "max")}
+    counts = None
+    if (histogram := content.get("histogram")) is not None:
+        arrays |= {name: np.array(histogram[name], np.float64) for name in ("low", "high")}
+        counts = np.array(histogram["counts"], np.int64)
+    return FieldStatistics(count=int(content["count"]), histogram=counts, **arrays)
+
+
+def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
+    """Compute the statistics of one field.
+
+    Args:
+        values: Its values, shape (rows, width) or (rows,), at least one row.
+        field: What they are; histograms are made when it has both finite limits.
+
+    Returns:
+        The statistics of its columns.
+    """
+    table = np.asarray(values, np.float64).reshape(len(values), -1)
+    mean = table.mean(axis=0)
+    low, high = _limits(field, table.shape[1])
+    return FieldStatistics(
+        count=len(table),
+        mean=mean,
+        m2=np.square(table - mean).sum(axis=0),
+        minimum=table.min(axis=0),
+        maximum=table.max(axis=0),
+        low=low,
+        high=high,
+        histogram=None if low is None or high is None else _histogram(table, low, high),
+    )
+
+
+def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, None]:
+    """Return the limits of every column, shape (c,) each, or nothing if one of them is open."""
+    if field.valid_min is None or field.valid_max is None:
+        return None, None
+    low, high = np.array(field.valid_min, np.float64), np.array(field.valid_max, np.float64)
+    if low.shape != (columns,) or high.shape != (columns,):
+        raise DatasetError(f"field {field.name!r} must have {columns} limits, got {low.shape} and {high.shape}")
+    return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else (None, None)
+
+
+def _histogram(table: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
+    """Count the rows of every column in its bins, shape (c, 64)."""
+    width = np.where(high > low, high - low, 1.0)
+    bins = np.clip(np.floor((table - low) / width * N_BINS), 0, N_BINS - 1).astype(np.int64)
+    columns = table.shape[1]
+    flat = bins + N_BINS * np.arange(columns)
+    return np.bincount(flat.ravel(), minlength=N_BINS * columns).reshape(columns, N_BINS)
+
+
+def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field]) -> dict[str, FieldStatistics]:
+    """Compute the statistics of every field, in the fields' order."""
+    return {field.name: field_statistics(columns[field.name], field) for field in fields}
+
+
+def merge_statistics(
+    parts: Sequence[Mapping[str, FieldStatistics]],
+) -> dict[str, FieldStatistics]:
+    """Merge the statistics of shards, in the given order.
+
+    Raises:
+        DatasetError: There are no parts, or they are of different fields.
+    """
+    if not parts:
+        raise DatasetError("there are no statistics to merge")
+    merged = dict(parts[0])
+    for part in parts[1:]:
+        if part.keys() != merged.keys():
+            raise DatasetError(f"statistics of different fields cannot be merged: {list(merged)} and {list(part)}")
+        merged = {name: merged[name].merge(part[name]) for name in merged}
+    return merged

@@ -1,0 +1,103 @@
+"""The finished shards of a dataset, taken together in shard order."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.outcome import Outcome, densities_to_json, merge_outcomes
+from cnpgen.store.plan import DatasetPlan, ShardTask, shards
+from cnpgen.store.record import ShardRecord, load_committed
+from cnpgen.store.statistics import FieldStatistics, merge_statistics
+
+STATS_FORMAT = "cnpgen-stats"
+STATS_FORMAT_VERSION = 1
+_N_SHOWN = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """A plan and the records of its shards.
+
+    Attributes:
+        plan: The plan.
+        records: Every finished shard and its record, in the plan's order.
+        problems: Why each of the others is not finished.
+    """
+
+    plan: DatasetPlan
+    records: tuple[tuple[ShardTask, ShardRecord], ...]
+    problems: tuple[str, ...] = ()
+
+    @property
+    def n_shards(self) -> int:
+        """Number of shards of the plan."""
+        return len(self.records) + len(self.problems)
+
+    def of_split(self, split: str) -> list[tuple[ShardTask, ShardRecord]]:
+        """List the finished shards of a split, in order."""
+        return [(task, record) for task, record in self.records if task.split == split]
+
+    @cached_property
+    def outcomes(self) -> dict[str, Outcome]:
+        """The fates of the draws, split by split."""
+        return {split: merge_outcomes([item.outcome for _, item in self.of_split(split)]) for split in self.plan.splits}
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """The fates of all draws."""
+        return merge_outcomes(list(self.outcomes.values()))
+
+    @cached_property
+    def statistics(self) -> dict[str, dict[str, FieldStatistics]]:
+        """The statistics of every split that has finished shards: split -> field -> statistics."""
+        parts = {split: [item.statistics for _, item in self.of_split(split)] for split in self.plan.splits}
+        return {split: merge_statistics(items) for split, items in parts.items() if items}
+
+
+def summarise(folder: Path, plan: DatasetPlan, *, allow_partial: bool = False) -> Summary:
+    """Read the sidecars of a dataset.
+
+    Args:
+        folder: The dataset's folder.
+        plan: Its plan.
+        allow_partial: Take what is there instead of refusing.
+
+    Raises:
+        DatasetError: A shard is missing, damaged or of another plan; the message says which.
+        MachineError: The system would not let us read something.
+    """
+    records, problems = [], []
+    for task in shards(plan):
+        try:
+            records.append((task, load_committed(folder, task, plan.fingerprint)))
+        except DatasetError as error:
+            problems.append(str(error))
+    summary = Summary(plan, tuple(records), tuple(problems))
+    if problems and not allow_partial:
+        more = [f"and {len(problems) - _N_SHOWN} more"] if len(problems) > _N_SHOWN else []
+        shown = "\n  ".join([*problems[:_N_SHOWN], *more])
+        raise DatasetError(f"{folder} is {unfinished(summary)}:\n  {shown}")
+    return summary
+
+
+def unfinished(summary: Summary) -> str:
+    """Say how far an unfinished dataset is and what to do."""
+    return f"unfinished: {len(summary.records)} of {summary.n_shards} shards; run make-dataset again"
+
+
+def stats_document(summary: Summary) -> dict[str, Any]:
+    """Return the content of ``stats.json``: statistics of every field and the density maps, split by split."""
+    return {
+        "format": STATS_FORMAT,
+        "format_version": STATS_FORMAT_VERSION,
+        "plan_fingerprint": summary.plan.fingerprint,
+        "splits": {split: _fields_json(fields) for split, fields in summary.statistics.items()},
+        "densities": {split: densities_to_json(item.densities) for split, item in summary.outcomes.items()},
+    }
+
+
+def _fields_json(fields: Mapping[str, FieldStatistics]) -> dict[str, Any]:
+    return {name: item.to_json() for name, item in fields.items()}

@@ -1,0 +1,163 @@
+"""Quantities as people write them, ``"50 ms"`` or ``"[0.6, 1.3] m"``, read as floats in SI units."""
+
+import math
+import re
+from decimal import Decimal
+from typing import Any
+
+from cnpgen.errors import nearest
+
+_SCALES = {
+    "1": {"1": "1", "%": "0.01"},
+    "m": {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"},
+    "s": {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"},
+    "rad": {"rad": "1", "mrad": "0.001", "deg": "0.0174532925199432957692369"},
+    "rad/s": {"rad/s": "1", "deg/s": "0.0174532925199432957692369", "rpm": "0.1047197551196597746154214"},
+    "rad/s^2": {"rad/s^2": "1", "deg/s^2": "0.0174532925199432957692369"},
+    "m/s": {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"},
+    "m/s^2": {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"},
+    "kg": {"kg": "1", "g": "0.001", "t": "1000"},
+    "N": {"N": "1", "kN": "1000"},
+    "N m": {"N m": "1", "Nm": "1", "kN m": "1000"},
+    "1/s": {"1/s": "1", "Hz": "1"},
+    "kg m^2": {"kg m^2": "1"},
+}
+
+UNITS: dict[str, tuple[str, Decimal]] = {
+    unit: (si, Decimal(factor)) for si, scale in _SCALES.items() for unit, factor in scale.items()
+}
+"""Unit -> its SI unit and what one of it is in that. Decimal, so that "9 mm" and 0.009 are the same float."""
+
+_DIMENSIONS = {
+    "1": "a number",
+    "m": "a length [m]",
+    "s": "a time [s]",
+    "rad": "an angle [rad]",
+    "rad/s": "an angular velocity [rad/s]",
+    "rad/s^2": "an angular acceleration [rad/s^2]",
+    "m/s": "a velocity [m/s]",
+    "m/s^2": "an acceleration [m/s^2]",
+    "kg": "a mass [kg]",
+    "N": "a force [N]",
+    "N m": "a torque [N m]",
+    "1/s": "a rate [1/s]",
+    "kg m^2": "an inertia [kg m^2]",
+}
+
+_QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)(.*)", re.DOTALL)
+_LIST = re.compile(r"\s*\[(.*)\](.*)", re.DOTALL)
+_SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"), ("µ", "u"))
+
+
+def dimension(unit: str) -> str:
+    """Name what is measured in an SI unit: ``"a time [s]"``."""
+    return _DIMENSIONS.get(unit, f"a quantity [{unit}]")
+
+
+def show(value: object) -> str:
+    """Write a TOML value as its file has it, cut to a length that fits into a message."""
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def parse_number(value: Any, unit: str) -> float:
+    """Read one number or quantity.
+
+    Args:
+        value: An int or a float, in ``unit``; or a text such as ``"50 ms"`` or ``"0.05"``.
+        unit: SI unit of the result.
+
+    Returns:
+        The value [unit].
+
+    Raises:
+        ValueError: The value is no finite number, or its unit is unknown or measures something else.
+    """
+    match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+    if match:
+        ordinary = 0.0 < abs(float(match[1])) < math.inf
+        return _finite(Decimal(match[1]) if ordinary else float(match[1]), match[2], value, unit)
+    if isinstance(value, bool | str) or not isinstance(value, int | float):
+        raise ValueError(f"expected {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's mistake
+    return _finite(value, "", value, unit)
+
+
+def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[float, ...]:
+    """Read a list of numbers or quantities.
+
+    Args:
+        value: A list of what ``parse_number`` reads, or a text such as ``"[0.6, 1.3] m"``.
+        unit: SI unit of the result.
+        count: How many there must be; None for one or more.
+
+    Returns:
+        The values [unit].
+
+    Raises:
+        ValueError: It is no list, has the wrong length, or one of its entries is wrong.
+    """
+    match = _LIST.fullmatch(value) if isinstance(value, str) else None
+    items = [f"{item.strip()} {match[2]}" for item in match[1].split(",")] if match else value
+    if not isinstance(items, list):
+        raise ValueError(f"expected a list, each {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's mistake
+    if not items or (match and not match[1].strip()):
+        raise ValueError("is empty, expected at least one number")
+    if count not in (None, len(items)):
+        raise ValueError(f"expected {count} numbers, got {len(items)}: {show(value)}")
+    return tuple(parse_number(item, unit) for item in items)
+
+
+def parse_range(value: Any, unit: str) -> tuple[float, float]:
+    """Read a closed interval.
+
+    Args:
+        value: A list of two, ``"[0.6, 1.3] m"``, or what ``parse_number`` reads: a single point.
+        unit: SI unit of the result.
+
+    Returns:
+        Its low and high end [unit].
+
+    Raises:
+        ValueError: An end is wrong, or the low end is above the high end.
+    """
+    if isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("[")):
+        low, high = parse_numbers(value, unit, count=2)
+    else:
+        low = high = parse_number(value, unit)
+    if low > high:
+        raise ValueError(f"empty range {show(value)}: its low end is above its high end")
+    return low, high
+
+
+def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> float:
+    """Convert ``number suffix`` to ``unit``; ``value`` is what the user wrote."""
+    factor = _factor(_spell(suffix), value, unit)
+    try:
+        result = float(number * factor if isinstance(number, Decimal) else number)
+    except ArithmeticError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise ValueError(f"expected {dimension(unit)} that is finite, got {show(value)}")
+    return result + 0.0  # no negative zero: "-0" and "0" are the same recipe
+
+
+def _factor(written: str, value: object, unit: str) -> Decimal:
+    """Return what one ``written`` is in ``unit``."""
+    if written in ("", unit):
+        return Decimal(1)
+    if written not in UNITS:
+        same = [known for known, (si, _) in UNITS.items() if si == unit]
+        hint = nearest(written, same) or nearest(written, UNITS)
+        raise ValueError(f"unknown unit {written!r} in {show(value)}, expected {dimension(unit)}{hint}")
+    si, factor = UNITS[written]
+    if si != unit:
+        raise ValueError(f"expected {dimension(unit)}, got {show(value)}")
+    return factor
+
+
+def _spell(unit: str) -> str:
+    """Bring the spellings of a unit to one: ``"N·m"`` to ``"N m"``, ``"/s"`` to ``"1/s"``."""
+    for old, new in _SPELLINGS:
+        unit = unit.replace(old, new)
+    unit = re.sub(r"\s*/\s*", "/", " ".join(unit.split()))
+    return f"1{unit}" if unit.startswith("/") else unit

@@ -1,0 +1,1 @@
+"""The independent judge: rows recomputed with Pinocchio and Coal, sharing no code with the stages or the kernels."""

@@ -1,0 +1,197 @@
+"""Recompute what the rows of a dataset claim: every constraint at both ends, positions and hits, from the stored numbers."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cnpgen.constraints.constraint import EXACTNESS, Condition
+from cnpgen.errors import DatasetError
+from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
+from cnpgen.verify.world import World, obstacle_tops
+
+if TYPE_CHECKING:
+    from cnpgen.recipes import Problem
+    from cnpgen.robots.robot import Robot
+
+BLOCK = 1024  # rows: what is collected of a block before it is judged stays below 10 MB
+
+_REQUIRED = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
+_DERIVATIVES = ("q", "dq", "ddq")
+
+Key = tuple[str, str, str]  # name, unit and exactness of a condition
+
+
+def verify_rows(
+    problem: "Problem", robot: "Robot", columns: Mapping[str, ArrayLike], dtype: str = "float64"
+) -> RowReport:
+    """Verify rows with Pinocchio and Coal.
+
+    Checked are, at both ends of every row: all values are finite ("not finite"); the tip is where ``*_xyz`` says ("tip
+    position"); what every constraint of the problem asks of a boundary state, under its conditions' names; and, if the rows have
+    ``hit_angle`` and ``hit_speed``, that the tip moves that way ("hit direction", where the speed is positive) that fast ("hit
+    speed") at the goal. How exactly is ``cnpgen.constraints.constraint.EXACTNESS``. A row that is not finite fails under that
+    name only. Conditions on accelerations are skipped at an end whose accelerations are not stored, unless the row is at rest
+    there: a robot that stands still has ddq = 0, hence its static torque is checked.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
+            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle`` and ``hit_speed``.
+            Of other fields only whether they are finite is checked.
+        dtype: The float type that the rows are stored in, which decides how exact they must be.
+
+    Raises:
+        DatasetError: A field is missing or has another shape.
+    """
+    values = _read(columns, robot.n)
+    rows = len(values["start_q"])
+    world = World(problem, robot)
+    return merge(
+        [
+            _verify_block(
+                problem, world, {name: column[first : first + BLOCK] for name, column in values.items()}, dtype
+            )
+            for first in range(0, max(rows, 1), BLOCK)
+        ]
+    )
+
+
+def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
+    """Convert columns to float64 of shape (rows, width) and check their shapes."""
+    missing = [name for name in _REQUIRED if name not in columns]
+    if missing:
+        raise DatasetError(f"the rows have no field {', '.join(missing)}")
+    values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
+    rows = len(values["start_q"])
+    widths = {f"{end}_{what}": n for end in ENDS for what in _DERIVATIVES} | {f"{end}_xyz": 3 for end in ENDS}
+    for name, column in values.items():
+        if len(column) != rows or (name in widths and column.shape != (rows, widths[name])):
+            raise DatasetError(f"field {name} must have shape ({rows}, {widths.get(name, '...')}), got {column.shape}")
+    return {name: column.reshape(rows, -1) for name, column in values.items()}
+
+
+@dataclass
+class _Values:
+    """The values of one condition over many states, and their bounds; lists grow faster than arrays."""
+
+    g: list[float] = field(default_factory=list)
+    lower: list[float] = field(default_factory=list)
+    upper: list[float] = field(default_factory=list)
+    where: list[tuple[int, int, int]] = field(default_factory=list)  # row, end, number of values
+
+    def add(self, condition: Condition, row: int, end: int) -> None:
+        self.g.extend(condition.g)
+        self.lower.extend(condition.lower.tolist())
+        self.upper.extend(condition.upper.tolist())
+        self.where.append((row, end, len(condition.g)))
+
+    def judged(self, key: Key, dtype: str) -> tuple[Check, Index]:
+        name, unit, exactness = key
+        g, lower, upper = (np.array(values, float) for values in (self.g, self.lower, self.upper))
+        row, end, count = np.array(self.where, np.int64).T
+        allowed = Condition(name, unit, self.g, lower, upper, exactness).slack(dtype)
+        violation = np.maximum(np.maximum(lower - g, g - upper), 0.0)
+        where = {"row": np.repeat(row, count), "end": np.repeat(end, count)}
+        return judge(name, unit, violation=violation, allowed=allowed, **where)
+
+
+@dataclass
+class _Block:
+    """What is measured in a block of rows.
+
+    Attributes:
+        position: Tip positions [m], shape (rows, 2, 3); nan where nothing was measured.
+        hit_velocity: Tip velocities at the goal [m/s], shape (rows, 3); likewise.
+        conditions: The constraints' conditions, in order of first use.
+    """
+
+    position: Array
+    hit_velocity: Array
+    conditions: dict[Key, _Values] = field(default_factory=dict)
+
+
+def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], dtype: str) -> RowReport:
+    rows = len(columns["start_q"])
+    n_bad = np.sum([np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0)
+    finite = np.flatnonzero(n_bad == 0)
+    block = _measure(problem, world, columns, finite)
+    everywhere = np.arange(rows), np.zeros(rows, np.int64)
+    judged = [
+        judge(
+            "not finite",
+            "1",
+            violation=n_bad.astype(float),
+            allowed=np.zeros(rows),
+            row=everywhere[0],
+            end=everywhere[1],
+        ),
+        _judge_position(block, columns, finite, dtype),
+        *(values.judged(key, dtype) for key, values in block.conditions.items()),
+        *_judge_hit(block, columns, finite, dtype),
+    ]
+    out = np.unique(np.concatenate([rows_out for _, rows_out in judged]))
+    return RowReport(rows, tuple(check for check, _ in judged), out)
+
+
+def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite: Index) -> _Block:
+    """Move the world to both ends of every finite row and note what it measures there."""
+    rows = len(columns["start_q"])
+    tops = obstacle_tops(problem, columns["start_xyz"], columns["goal_xyz"])
+    block = _Block(np.full((rows, 2, 3), np.nan), np.full((rows, 3), np.nan))
+    for index, end in enumerate(ENDS):
+        (q, dq, ddq), orders = _states(columns, end)
+        for row in finite.tolist():
+            world.set_state(q[row], dq[row], ddq[row], tops[row])
+            block.position[row, index] = world.tip_position
+            found = chain.from_iterable(c.measured_at(world, end) for c in problem.constraint)
+            _note(block, found, orders[row], (row, index))
+            if end == "goal" and "hit_speed" in columns:
+                block.hit_velocity[row] = world.tip_velocity
+    return block
+
+
+def _note(block: _Block, found: Iterator[Condition], order: int, where: tuple[int, int]) -> None:
+    """Keep the conditions that need no higher derivative than is known."""
+    for condition in found:
+        if condition.needs <= order:
+            key = condition.name, condition.unit, condition.exactness
+            block.conditions.setdefault(key, _Values()).add(condition, *where)
+
+
+def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:
+    """Return q, dq and ddq at an end, 0 where not stored, and per row the highest derivative that is known."""
+    q, dq, ddq = (columns.get(f"{end}_{what}", np.zeros_like(columns[f"{end}_q"])) for what in _DERIVATIVES)
+    if f"{end}_ddq" in columns:
+        return [q, dq, ddq], [2] * len(q)
+    return [q, dq, ddq], np.where(np.any(dq != 0, axis=1), 1, 2).tolist()
+
+
+def _judge_position(block: _Block, columns: dict[str, Array], finite: Index, dtype: str) -> tuple[Check, Index]:
+    claimed = np.stack([columns[f"{end}_xyz"] for end in ENDS], axis=1)
+    error = np.linalg.norm(block.position - claimed, axis=2)[finite].ravel()
+    row, end = np.repeat(finite, len(ENDS)), np.tile(np.arange(len(ENDS)), len(finite))
+    allowed = np.full(error.shape, EXACTNESS[dtype]["position"])
+    return judge("tip position", "m", violation=error, allowed=allowed, row=row, end=end)
+
+
+def _judge_hit(block: _Block, columns: dict[str, Array], finite: Index, dtype: str) -> Iterator[tuple[Check, Index]]:
+    """Judge direction and speed of the tip at the goal, in the x-y plane."""
+    if "hit_angle" not in columns or "hit_speed" not in columns:
+        return
+    angle, speed = columns["hit_angle"][finite, 0], columns["hit_speed"][finite, 0]
+    x, y, _ = block.hit_velocity[finite].T
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    moving = speed > 0
+
+    def judged(name: str, unit: str, error: Any, rows: Index, exactness: str) -> tuple[Check, Index]:
+        allowed = np.full(len(rows), EXACTNESS[dtype][exactness])
+        return judge(name, unit, violation=np.abs(error), allowed=allowed, row=rows, end=np.ones(len(rows), np.int64))
+
+    direction = np.arctan2(across, along)[moving]
+    yield judged("hit direction", "rad", direction, finite[moving], "angle")
+    yield judged("hit speed", "m/s", along - speed, finite, "velocity")

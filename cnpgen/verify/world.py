@@ -1,0 +1,130 @@
+"""One robot state as Pinocchio and Coal see it: what the constraints' ``measured`` forms ask of it."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError
+from cnpgen.verify.scene import Scene
+
+if TYPE_CHECKING:
+    from cnpgen.recipes import Problem
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class World:
+    """The robot of a problem at one state, among the obstacles.
+
+    ``set_state`` runs the forward kinematics; everything else is computed when it is read. All vectors are in the world frame.
+    A world belongs to one process and one thread: Pinocchio's and Coal's memory is reused from state to state.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+
+    Attributes:
+        robot: The robot.
+        q: Joint positions [rad], shape (n,).
+        dq: Joint velocities [rad/s], shape (n,).
+        ddq: Joint accelerations [rad/s^2], shape (n,).
+    """
+
+    def __init__(self, problem: "Problem", robot: "Robot") -> None:
+        self.robot = robot
+        self._model = robot.model
+        self._data = self._model.createData()
+        self._dynamics_data = self._model.createData()  # RNEA's accelerations include gravity: kept apart
+        self._tip = self._model.getFrameId(robot.tip)
+        self._object_size = None if problem.object is None else problem.object.size
+        self._scene = Scene(problem.obstacle, self._object_size, len(robot.skeleton))
+        self._skeleton = robot.skeleton
+        zero = np.zeros(robot.n)
+        self.set_state(robot.base, zero, zero, np.zeros(len(problem.obstacle)))
+
+    def set_state(self, q: Array, dq: Array, ddq: Array, tops: Array) -> None:
+        """Move to a state.
+
+        Args:
+            q: Joint positions [rad], shape (n,).
+            dq: Joint velocities [rad/s], shape (n,).
+            ddq: Joint accelerations [rad/s^2], shape (n,).
+            tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
+        """
+        import pinocchio as pin
+
+        self.q, self.dq, self.ddq = q, dq, ddq
+        pin.forwardKinematics(self._model, self._data, q, dq, ddq)
+        self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
+        self._scene.set_tops(tops.tolist())
+
+    @property
+    def torque(self) -> Array:
+        """Inverse dynamics [N m], shape (n,)."""
+        import pinocchio as pin
+
+        return np.array(pin.rnea(self._model, self._dynamics_data, self.q, self.dq, self.ddq))
+
+    @property
+    def tip_position(self) -> Array:
+        """Position of the tip [m], shape (3,)."""
+        return np.array(self._T_world_tip.translation)
+
+    @property
+    def tip_rotation(self) -> Array:
+        """Rotation matrix of the tip frame, shape (3, 3)."""
+        return np.array(self._T_world_tip.rotation)
+
+    @property
+    def tip_velocity(self) -> Array:
+        """Linear velocity of the tip [m/s], shape (3,)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).linear)
+
+    @property
+    def tip_acceleration(self) -> Array:
+        """Linear acceleration of the tip [m/s^2], shape (3,)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.getFrameClassicalAcceleration(self._model, self._data, self._tip, frame).linear)
+
+    def segment_distances(self) -> list[float]:
+        """Measure how far every segment of the robot's skeleton is from every obstacle, segment by segment [m]."""
+        points = [pose.translation.tolist() for pose in self._data.oMi[1:]]
+        points.append(self._T_world_tip.translation.tolist())
+        return self._scene.segment_distances([(points[a], points[b]) for a, b in self._skeleton])
+
+    def object_distances(self) -> list[float]:
+        """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
+
+        Raises:
+            RecipeError: The problem has no object.
+        """
+        if self._object_size is None:
+            raise RecipeError(
+                ["a constraint asks for the distance of the held object, but the problem has no [object]"]
+            )
+        return self._scene.object_distances(self._T_world_tip.translation, self._T_world_tip.rotation)
+
+
+def obstacle_tops(problem: "Problem", start_xyz: Array, goal_xyz: Array) -> Array:
+    """Compute the heights of the obstacles' upper faces [m], shape (..., n_obstacles).
+
+    An obstacle with ``below`` ends at the bottom of the object (at the tip, if there is none) at that end of the motion.
+
+    Args:
+        problem: The problem.
+        start_xyz: Tip positions at the start [m], shape (..., 3).
+        goal_xyz: Tip positions at the goal [m], shape (..., 3).
+    """
+    half = 0.0 if problem.object is None else problem.object.size[2] / 2
+    bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
+    tops = np.empty((*bottoms["start"].shape, len(problem.obstacle)))
+    for index, box in enumerate(problem.obstacle):
+        tops[..., index] = bottoms[box.below] if box.top is None else box.top
+    return tops

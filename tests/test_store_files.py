@@ -1,0 +1,127 @@
+"""Atomic files: whole or absent, whatever the disk says."""
+
+import errno
+import hashlib
+import os
+import resource
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cnpgen.errors import DatasetError, MachineError
+from cnpgen.store.files import committing, file_sha256, read_file, sweep, write_file
+
+
+def failing(code: int) -> Callable[..., None]:
+    def fail(*_arguments: object, **_options: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    return fail
+
+
+def test_a_written_file_is_whole_and_nothing_else_is_left(tmp_path: Path) -> None:
+    write_file(tmp_path / "a" / "b.txt", "grün\n")
+    write_file(tmp_path / "a" / "b.txt", b"again")
+    assert (tmp_path / "a" / "b.txt").read_bytes() == b"again"
+    assert list((tmp_path / "a").iterdir()) == [tmp_path / "a" / "b.txt"]
+
+
+def test_the_file_is_flushed_before_it_is_renamed_and_its_folder_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    sync, rename = os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda fd: (steps.append("sync"), sync(fd))[1])
+    monkeypatch.setattr(Path, "replace", lambda self, target: (steps.append("rename"), rename(self, target))[1])
+    write_file(tmp_path / "a", b"x")
+    assert steps == ["sync", "rename", "sync"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO])
+@pytest.mark.parametrize("step", ["fsync", "write", "rename", "mkdir"])
+def test_a_failing_disk_is_a_machine_error_that_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, code: int
+) -> None:
+    path = tmp_path / "a.txt"
+    write_file(path, b"old")
+    owner: object = os if step == "fsync" else Path
+    name = {"fsync": "fsync", "write": "write_bytes", "rename": "replace", "mkdir": "mkdir"}[step]
+    monkeypatch.setattr(owner, name, failing(code))
+    with pytest.raises(MachineError) as caught:
+        write_file(path, b"new")
+    assert str(path) in str(caught.value)
+    assert os.strerror(code) in str(caught.value)
+    assert caught.value.exit_code == 3
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_named_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
+    with pytest.raises(MachineError, match=r"free some space and run the same command again"):
+        write_file(tmp_path / "a", b"new")
+
+
+def test_a_write_that_the_system_cuts_off_leaves_nothing(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+        with pytest.raises(MachineError, match="ulimit"):
+            write_file(tmp_path / "a", bytes(10_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_below_a_file_is_a_machine_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MachineError, match="a file is where a folder should be"):
+        write_file(tmp_path / "file" / "a", b"x")
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), committing(tmp_path / "a") as temporary:
+        temporary.write_bytes(b"half")
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_writers_of_one_file_use_different_temporary_files(tmp_path: Path) -> None:
+    with committing(tmp_path / "a") as first, committing(tmp_path / "a") as second:
+        assert first != second
+        assert first.parent == second.parent == tmp_path
+        first.write_bytes(b"1")
+        second.write_bytes(b"2")
+    assert (tmp_path / "a").read_bytes() == b"1"
+
+
+def test_sha256_is_that_of_the_bytes(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(bytes(300_000))
+    assert file_sha256(tmp_path / "a") == hashlib.sha256(bytes(300_000)).hexdigest()
+
+
+@pytest.mark.parametrize("read", [file_sha256, read_file])
+def test_a_missing_file_is_a_dataset_error_and_an_unreadable_one_a_machine_error(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    with pytest.raises(DatasetError, match="missing"):
+        read(tmp_path / "nothing")
+    with pytest.raises(MachineError, match="cannot read"):
+        read(tmp_path)
+
+
+def test_sweeping_removes_temporary_files_and_keeps_others(tmp_path: Path) -> None:
+    work = tmp_path / "_work"
+    sweep(work)
+    work.mkdir()
+    (work / ".a.1.2.tmp").write_text("")
+    sweep(work)
+    assert not work.exists()
+    work.mkdir()
+    (work / "log.txt").write_text("")
+    sweep(work)
+    assert (work / "log.txt").exists()
