@@ -27,7 +27,10 @@ class RecipeError(CnpgenError):
 
     def __init__(self, mistakes: Sequence[str]) -> None:
         self.mistakes = tuple(mistakes)
-        super().__init__("\n".join(self.mistakes))
+        super().__init__(self.mistakes)  # so that it can be pickled by worker processes
+
+    def __str__(self) -> str:
+        return "\n".join(self.mistakes)
 
 
 class DatasetError(CnpgenError):

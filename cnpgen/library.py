@@ -1,6 +1,7 @@
 """Find, list and load recipes: those that cnpgen ships by name, anybody's by path."""
 
 import hashlib
+import json
 import os
 import re
 import tomllib
@@ -69,6 +70,47 @@ def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = 
         RecipeError: With every mistake in all three files.
     """
     return _load(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
+
+
+def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
+    """Rebuild a recipe from what ``recipes.resolved`` made of it, as plans of datasets keep it.
+
+    Args:
+        content: The resolved recipe.
+        urdf: Text of the robot's URDF file.
+        folder: Where the URDF file is written to.
+
+    Raises:
+        RecipeError: The content does not fit this version of cnpgen, or a plug-in that it needs is not installed.
+    """
+    path, mistakes = folder / "recipe.toml", list[str]()
+    content = _without_defaults(content)
+    problem_table = content["pipeline"]["problem"]
+    problem_table["robot"]["urdf"] = "robot.urdf"
+    (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
+
+    def problem(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
+        readers: dict[type, Reader] = {Constraint: partial(_read_kind, plugins.CONSTRAINTS)}
+        made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
+        digest = _digest(json.dumps(value, sort_keys=True).encode(), urdf.encode())
+        return made and replace(made, path=path, digest=digest)
+
+    def pipeline(value: Any, where: Place, mistakes: list[str]) -> Pipeline | None:
+        readers: dict[type, Reader] = {Stage: partial(_read_kind, plugins.STAGES), Problem: problem}
+        made = parse(Pipeline, value, where=where, mistakes=mistakes, readers=readers)
+        return made and replace(made, path=path)
+
+    made = parse(DatasetRecipe, content, where=Place(str(path)), mistakes=mistakes, readers={Pipeline: pipeline})
+    if made is None or mistakes:
+        raise RecipeError(mistakes)
+    return replace(made, path=path)
+
+
+def _without_defaults(value: Any) -> Any:
+    """Leave out nulls and empty arrays: in a recipe they can only be said by leaving the key out."""
+    if isinstance(value, dict):
+        return {key: _without_defaults(entry) for key, entry in value.items() if entry is not None and entry != []}
+    return [_without_defaults(entry) for entry in value] if isinstance(value, list) else value
 
 
 def list_recipes(kind: Kind) -> dict[str, Path]:

@@ -1,6 +1,5 @@
 """Problem, Pipeline and DatasetRecipe: the three nouns that users write as TOML files."""
 
-# ruff: noqa: RUF009 - cnpgen.schema.field is dataclasses.field with metadata
 import hashlib
 import json
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from cnpgen.pipelines.stage import Stage
 from cnpgen.schema import Range, field, to_dict
 
 NAME = "^[a-z0-9][a-z0-9-]*$"
-SPLIT_NAME = "^[a-z][a-z0-9_-]*$"
+SPLIT_NAME = "^[a-z][a-z0-9_]*$"
 VERSION = r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$"
 
 

@@ -247,14 +247,16 @@ class _Parser:
             return self.entries(args[1], value, key, where)
         if get_origin(hint) is tuple and args[0] is float:
             return _floats(value, key, None if args[1] is Ellipsis else len(args))
-        if get_origin(hint) is tuple and args[1] is Ellipsis:
-            return self.array(args[0], value, key, where)
+        if get_origin(hint) is tuple:
+            return self.array(args[0], None if args[1] is Ellipsis else len(args), value, key, where)
         raise ValueError(f"the type of this key, {hint}, is not one that a recipe can hold")
 
-    def array(self, hint: Any, values: Any, key: Key, where: Place) -> tuple[Any, ...]:
+    def array(self, hint: Any, count: int | None, values: Any, key: Key, where: Place) -> tuple[Any, ...]:
         _check_filled(list, values, key)
         if hint is Range and any(isinstance(item, int | float) for item in values):
             raise ValueError(f"expected a list of ranges, got {show(values)}; write a point as [0.1, 0.1]")
+        if count not in (None, len(values)):
+            raise ValueError(f"expected {count} entries, got {len(values)}: {show(values)}")
         return tuple(self.value(hint, item, key, where / index) for index, item in enumerate(values))
 
     def entries(self, hint: Any, values: Any, key: Key, where: Place) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[f
         ValueError: It is no list, has the wrong length, or one of its entries is wrong.
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
-    items = [f"{item.strip()} {match[2]}" for item in match[1].split(",")] if match else value
+    items = [f"{item.strip()} {match[2].strip()}".strip() for item in match[1].split(",")] if match else value
     if not isinstance(items, list):
         raise ValueError(f"expected a list, each {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's mistake
     if not items or (match and not match[1].strip()):

@@ -148,3 +148,9 @@ def test_name_of_an_unregistered_class_says_where_it_is(register):
 def test_every_group_has_a_base():
     assert {STAGES: Stage, CONSTRAINTS: Constraint} == plugins.BASES
     assert plugins.BASES.keys() == plugins.BUILT_IN.keys()
+
+
+@pytest.mark.parametrize("group", plugins.BASES)
+def test_every_built_in_kind_can_be_loaded(group):
+    for name in plugins.BUILT_IN[group]:
+        assert name_of(group, load(group, name)) == name

@@ -28,6 +28,7 @@ class Cart:
     colour: str = field("colour", default="red", choices=("red", "green"))
     tilt: Range = field("tilt", unit="rad", default=Range(0.0, 0.0), low=-1.0, high=1.0)
     stops: tuple[Range, ...] = field("where it stops", unit="m", default=())
+    box: tuple[Range, Range] = field("where it may be: x, y", unit="m", default=(Range(0.0, 1.0), Range(0.0, 1.0)))
     angles: tuple[float, ...] = field("steering angles", unit="rad", default=())
     size: tuple[float, float, float] = field("size", unit="m", default=(1.0, 1.0, 1.0), low=1e-3)
     riders: tuple[str, ...] = field("who rides", default=())
@@ -59,6 +60,7 @@ colour = "green"
 tilt = "[-5, 30] deg"
 stops = ["[0, 100] mm", [1, 2], "3 m"]
 angles = "[10, 20] deg"
+box = ["[0, 1] m", [2, 3]]
 size = ["10 cm", 0.2, 0.3]
 riders = ["ann", "bob"]
 load = "500 g"
@@ -82,6 +84,7 @@ def test_every_supported_type_is_read_in_si():
         colour="green",
         tilt=Range(pytest.approx(math.radians(-5)), pytest.approx(math.radians(30))),
         stops=(Range(0.0, 0.1), Range(1.0, 2.0), Range(3.0, 3.0)),
+        box=(Range(0.0, 1.0), Range(2.0, 3.0)),
         angles=(pytest.approx(math.radians(10)), pytest.approx(math.radians(20))),
         size=(0.1, 0.2, 0.3),
         riders=("ann", "bob"),
@@ -151,6 +154,8 @@ def test_every_mistake_is_reported_with_file_and_key():
         ("stops = '[0, 1] m'", "stops: expected a list, each a range, each end a length [m], got '[0, 1] m'"),
         ("stops = [[0, 1], [3, 2]]", "stops[1]: empty range [3, 2]"),
         ("stops = []", "stops: is empty, expected at least one: where it stops"),
+        ("box = [[0, 1]]", "box: expected 2 entries, got 1: [[0, 1]]"),
+        ("box = [[0, 1], [0, 1], [0, 1]]", "box: expected 2 entries, got 3"),
         ("angles = []", "angles: is empty"),
         ("angles = 1", "angles: expected a list, each an angle [rad], got 1"),
         ("size = [1, 1, 0]", "size: 0.0 m is too small"),

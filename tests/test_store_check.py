@@ -134,7 +134,8 @@ def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> Non
 def test_damage_to_an_unfinished_dataset_is_found(tmp_path: Path) -> None:
     make_shards(tmp_path)
     path = tmp_path / TASK.file
-    path.write_bytes(path.read_bytes()[:-8] + bytes(8))
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     (tmp_path / shards(PLAN)[1].sidecar).write_bytes(b"{")
     assert problems(tmp_path).keys() == {"manifest.json", TASK.file, shards(PLAN)[1].sidecar}
 

@@ -25,9 +25,9 @@ FIELD = Field("q", "rad", "positions", 4, valid_min=(-3.0, 0.0, 5.0, -1.0), vali
 
 
 def values(rows: int) -> NDArray[np.float64]:
-    """Columns that are spread, far from zero, constant and heavy-tailed beyond their limits."""
+    """Columns that are spread, off zero, constant and heavy-tailed beyond their limits."""
     random = np.random.default_rng(rows)
-    columns = [random.uniform(-3, 3, rows), 1e6 + random.random(rows), np.full(rows, 0.1), random.standard_cauchy(rows)]
+    columns = [random.uniform(-3, 3, rows), 10 + random.random(rows), np.full(rows, 0.1), random.standard_cauchy(rows)]
     return np.stack(columns, axis=1)
 
 
@@ -47,6 +47,13 @@ def test_merged_statistics_are_those_of_the_concatenation(cuts: Sequence[int]) -
     parts = [field_statistics(part, FIELD) for part in np.split(table, cuts)]
     merged = merge_statistics([{"q": part} for part in parts])["q"]
     assert_same(merged, field_statistics(table, FIELD))
+
+
+def test_a_narrow_column_far_from_zero_keeps_its_deviation() -> None:
+    table = 1e6 + np.random.default_rng(0).random((1000, 1))
+    field = Field("q", "1", "far", 1)
+    parts = [{"q": field_statistics(part, field)} for part in np.split(table, 10)]
+    np.testing.assert_allclose(merge_statistics(parts)["q"].std, table.std(axis=0), rtol=1e-9)
 
 
 def test_the_numbers_are_numpy_s() -> None:

@@ -137,7 +137,12 @@ def test_a_range_is_two_ends_or_one_point():
 
 @pytest.mark.parametrize(
     ("value", "message"),
-    [("[2, 1] m", "empty range"), ([1, 2, 3], "expected 2 numbers"), ("[1] m", "expected 2 numbers"), (True, "got true")],
+    [
+        ("[2, 1] m", "empty range"),
+        ([1, 2, 3], "expected 2 numbers"),
+        ("[1] m", "expected 2 numbers"),
+        (True, "got true"),
+    ],
 )
 def test_a_wrong_range_is_an_error(value, message):
     with pytest.raises(ValueError, match=message):

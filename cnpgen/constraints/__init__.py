@@ -1,1 +1,1 @@
-"""The constraint manifold: one file per kind of condition, each written symbolically and as an independent measurement."""
+"""The constraint manifold: one file per kind of condition, each in a symbolic and in a measured form."""

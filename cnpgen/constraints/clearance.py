@@ -1,7 +1,7 @@
 """Collision avoidance: the robot's capsules keep clear of the obstacles, the held object does not enter them."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class RobotClearance(Constraint):
         """Measure the distances with Coal [m]."""
         return self._clear(world.segment_distances())
 
-    def _clear(self, distances: list[object]) -> tuple[Condition, ...]:
+    def _clear(self, distances: list[Any]) -> tuple[Condition, ...]:
         m = len(distances)
         return (Condition("robot clearance", "m", distances, np.full(m, self.radius), np.full(m, np.inf), "position"),)
 
@@ -53,13 +53,13 @@ class ObjectContact(Constraint):
         """State the separation of the object from every obstacle [m]."""
         from cnpgen.robots.boxes import upright_box_separation
 
-        kin = state.kinematics
-        return self._shallow([upright_box_separation(kin.tip, kin.rotation, state.object_size, box) for box in state.boxes])
+        kin, size = state.kinematics, state.object_size or (0.0, 0.0, 0.0)
+        return self._shallow([upright_box_separation(kin.tip, kin.rotation, size, box) for box in state.boxes])
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
         return self._shallow(world.object_distances())
 
-    def _shallow(self, distances: list[object]) -> tuple[Condition, ...]:
+    def _shallow(self, distances: list[Any]) -> tuple[Condition, ...]:
         m = len(distances)
         return (Condition("object contact", "m", distances, np.full(m, -self.depth), np.full(m, np.inf), "position"),)

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 End = Literal["start", "goal"]
 
-# How exactly a boundary state must meet its conditions, by the type that it is stored in. Limits are relative, the rest is SI.
+# How exactly a boundary state must meet its conditions, by the type that it is stored in. Limits are relative, the
+# rest is SI.
 EXACTNESS: dict[str, dict[str, float]] = {
     "float64": {"limit": 1e-12, "position": 1e-8, "angle": 1e-8, "velocity": 1e-9, "acceleration": 1e-9},
     "float32": {"limit": 1e-12, "position": 1e-6, "angle": 1e-5, "velocity": 1e-5, "acceleration": 1e-4},
@@ -49,11 +50,13 @@ class Condition:
         exact = EXACTNESS[dtype][self.exactness]
         if self.exactness != "limit":
             return np.full(len(self.g), exact)
-        size = np.maximum(np.abs(np.nan_to_num(self.lower, posinf=0, neginf=0)), np.abs(np.nan_to_num(self.upper, posinf=0, neginf=0)))
+        size = np.maximum(
+            np.abs(np.nan_to_num(self.lower, posinf=0, neginf=0)), np.abs(np.nan_to_num(self.upper, posinf=0, neginf=0))
+        )
         return exact * np.maximum(size, 1.0)
 
     def violation(self) -> float:
-        """Return the worst ``max(lower - g, g - upper, 0)`` of a measured condition, in its unit; nan counts as infinite."""
+        """Return the worst ``max(lower - g, g - upper, 0)`` of a measured condition; nan counts as infinite."""
         g = np.array(self.g, float)
         worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
         return worst if np.isfinite(worst) else np.inf
@@ -61,10 +64,10 @@ class Condition:
 
 @dataclass(frozen=True, kw_only=True)
 class Constraint(ABC):
-    """One term of the constraint manifold: a condition on every state of a motion, and what it means at the motion's ends.
+    """One term of the constraint manifold: a condition on every state of a motion, and on its ends.
 
-    A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]`` table in ``problem.toml``; it is registered
-    under a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.constraints``.
+    A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]`` table in ``problem.toml``; it is
+    registered under a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.constraints``.
 
     Attributes:
         reason: The name under which a sample that breaks the constraint is counted.

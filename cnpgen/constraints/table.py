@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Table(Constraint):
-    """``x, y`` of the tip in a rectangle, ``z`` at the table's height; at the ends also ``dz/dt = 0`` and ``d2z/dt2 = 0``."""
+    """The tip in a rectangle at the table's height; at the ends also ``dz/dt = 0`` and ``d2z/dt2 = 0``."""
 
     reason = "off the table"
     x: Range = field("where the tip may be along world x", unit="m")
@@ -43,7 +43,9 @@ class Table(Constraint):
     def _position(self, tip: list[Any], band: float) -> tuple[Condition, ...]:
         low, high = np.array([self.x.low, self.y.low]), np.array([self.x.high, self.y.high])
         inside = Condition("table rectangle", "m", tip[:2], low, high, "position")
-        height = Condition("table height", "m", tip[2:], np.array([self.z - band]), np.array([self.z + band]), "position")
+        height = Condition(
+            "table height", "m", tip[2:], np.array([self.z - band]), np.array([self.z + band]), "position"
+        )
         return inside, height
 
     def _boundary(self, tip: list[Any], velocity: Any, acceleration: Any, end: End) -> tuple[Condition, ...]:

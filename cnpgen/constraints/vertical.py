@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 class Vertical(Constraint):
     """``R_02 = R_12 = 0`` and ``R_22 > 0``.
 
-    The paper's ``1 - R_22`` has no gradient at the solution; the two off-diagonal entries are the tilt [rad] to first order.
+    The paper's ``1 - R_22`` has no gradient at the solution; the two off-diagonal entries are the tilt [rad] to first
+    order.
     """
 
     reason = "not vertical"

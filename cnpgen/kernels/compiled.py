@@ -1,4 +1,4 @@
-"""Kernels as shared libraries: compiled once with the machine's C compiler, cached by content, called through ctypes."""
+"""Kernels as shared libraries: compiled once with the machine's C compiler, cached by content."""
 
 import ctypes
 import hashlib
@@ -30,7 +30,9 @@ class CompiledKernel(Kernel):
         try:
             self._function = ctypes.CDLL(str(library)).kernel
         except (OSError, AttributeError) as error:
-            raise MachineError(f"cannot load the compiled kernel {library}: {error}; delete it and run again") from error
+            raise MachineError(
+                f"cannot load the compiled kernel {library}: {error}; delete it and run again"
+            ) from error
         self._function.restype = None
 
     def __call__(self, *arguments: Array) -> list[Array]:

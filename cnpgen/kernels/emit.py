@@ -16,8 +16,9 @@ _BINARY = {
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
 
-# Vector types, comparisons (results are 1.0 or 0.0, as in CasADi) and sin/cos for |x| up to 2^20 (Cody and Waite's reduction
-# by pi/2 in three parts, then the minimax polynomials of the Cephes mathematical library: error below 1 ulp there).
+# Vector types, comparisons (results are 1.0 or 0.0, as in CasADi) and sin/cos for |x| up to 2^20 (Cody and Waite's
+# reduction by pi/2 in three parts, then the minimax polynomials of the Cephes mathematical library: error below 1 ulp
+# there).
 PRELUDE = r"""
 #include <math.h>
 #include <string.h>
@@ -95,8 +96,8 @@ I void store(double*p,long k,long n,v x){
 def emit(tape: Tape) -> str:
     """Write the C source of a kernel.
 
-    The function is ``void kernel(long n, const double *const *in, const long *ld, double *const *out)``: n lanes, one pointer per
-    argument and the distance between its rows, one pointer per result of contiguous rows.
+    The function is ``void kernel(long n, const double *const *in, const long *ld, double *const *out)``: n lanes, one
+    pointer per argument and the distance between its rows, one pointer per result of contiguous rows.
     """
     return PRELUDE + (_emit_loop(tape) if tape.loop else _emit_once(tape))
 
@@ -178,4 +179,3 @@ def statements(tape: Tape, *, read: Callable[[int, int], str], write: Callable[[
         names[k] = f"t{k}"
         lines.append(f"v t{k}={expression};")
     return "\n".join(lines)
-

@@ -1,4 +1,4 @@
-"""Kernels without a compiler: the tape run by NumPy, one operation at a time on blocks that stay in the processor's cache."""
+"""Kernels without a compiler: the tape run by NumPy, one operation at a time on blocks of lanes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,9 +21,11 @@ def _twice(x: Any, out: Array) -> None:
 
 _APPLY: dict[str, Callable[..., Any]] = {
     "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "NEG": np.negative, "SQ": np.square,
-    "TWICE": _twice, "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin, "COS": np.cos,
+    "TWICE": _twice, "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin,
+    "COS": np.cos,
     "EXP": np.exp, "FMIN": np.minimum, "FMAX": np.maximum, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
-    "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or, "IF_ELSE_ZERO": _if_else_zero,
+    "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or,
+    "IF_ELSE_ZERO": _if_else_zero,
 }  # fmt: skip
 _PLAIN = {"TWICE", "IF_ELSE_ZERO"}  # not ufuncs: no casting argument
 
@@ -62,7 +64,9 @@ class InterpretedKernel(Kernel):
             if len(active) == 0:
                 break
             every = len(active) == n
-            current = [state, *parameters] if every else [np.ascontiguousarray(x[:, active]) for x in (state, *parameters)]
+            current = (
+                [state, *parameters] if every else [np.ascontiguousarray(x[:, active]) for x in (state, *parameters)]
+            )
             following, now = self._evaluate(current, len(active))
             state[:, active], error[:, active] = following, now
             active = active[~(now[0] < loop.tolerance)]
@@ -88,9 +92,8 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
             place[k] = tape.constant[k]
             continue
         operands = [place[operand] for operand in _operands(tape, k, name)]
-        for operand in set(_operands(tape, k, name)):
-            if last[operand] == k and isinstance(place[operand], int):
-                free.append(place[operand])
+        dying = {operand for operand in _operands(tape, k, name) if last[operand] == k}
+        free.extend(place[operand] for operand in dying if isinstance(place[operand], int))
         if name == "OUTPUT":
             program.append(_bind_output(operands[0], int(tape.b[k]), int(tape.constant[k])))
             continue
@@ -99,7 +102,9 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         else:
             row, count = count, count + 1
         place[k] = row
-        program.append(_bind_input(row, int(tape.a[k]), int(tape.b[k])) if name == "INPUT" else _bind(name, operands, row))
+        program.append(
+            _bind_input(row, int(tape.a[k]), int(tape.b[k])) if name == "INPUT" else _bind(name, operands, row)
+        )
         if last[k] == 0:
             free.append(row)
     return max(count, 1), program

@@ -29,8 +29,8 @@ class Kernel(ABC):
             arguments: One float64 array of shape (width, N) per input of the tape, rows contiguous.
 
         Returns:
-            One new array of shape (width, N) per output. For a tape with a loop: the final state and the error of the state
-            before the last step, shape (1, N).
+            One new array of shape (width, N) per output. For a tape with a loop: the final state and the error of the
+            state before the last step, shape (1, N).
 
         Raises:
             ValueError: Shapes or types do not fit the tape.
@@ -41,7 +41,7 @@ def check_arguments(tape: Tape, arguments: Sequence[Array]) -> int:
     """Return the number of lanes N, or raise ValueError where arguments do not fit the tape."""
     if len(arguments) != len(tape.inputs):
         raise ValueError(f"kernel {tape.name}: needs {len(tape.inputs)} arguments, got {len(arguments)}")
-    n = arguments[0].shape[-1]
+    n = int(arguments[0].shape[-1])
     for index, (argument, width) in enumerate(zip(arguments, tape.inputs, strict=True)):
         if argument.shape != (width, n) or argument.dtype != np.float64 or (n > 1 and argument.strides[1] != 8):
             raise ValueError(

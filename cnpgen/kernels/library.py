@@ -60,7 +60,9 @@ class KernelLibrary:
             return InterpretedKernel(tape)
         return CompiledKernel(tape, compile_tape(tape, self.cache_folder))
 
-    def _tape(self, builder: Callable[..., Any], loop: Loop | None, given: Mapping[str, Any], parameters: Mapping[str, Any]) -> Tape:
+    def _tape(
+        self, builder: Callable[..., Any], loop: Loop | None, given: Mapping[str, Any], parameters: Mapping[str, Any]
+    ) -> Tape:
         import importlib.metadata
 
         identity = {
@@ -131,8 +133,10 @@ def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     if wanted is not None and wanted not in BACKENDS:
         raise UsageError(f"backend {wanted!r} does not exist: expected one of {', '.join(BACKENDS)}")
     folder = _writable(default_cache_folder())
-    if wanted in ("numpy", "casadi"):
-        return wanted, folder  # type: ignore[return-value]
+    if wanted == "numpy":
+        return "numpy", folder
+    if wanted == "casadi":
+        return "casadi", folder
     try:
         _try_compiler(folder)
     except MachineError as error:
@@ -152,8 +156,8 @@ def _writable(folder: Path) -> Path:
     except OSError as error:
         fallback = Path(tempfile.mkdtemp(prefix="cnpgen-cache-"))
         warnings.warn(
-            f"cannot write the kernel cache {folder} ({error.strerror or error}); kernels are built again into {fallback}"
-            " (set CNPGEN_CACHE to a writable folder)",
+            f"cannot write the kernel cache {folder} ({error.strerror or error});"
+            f" kernels are built again into {fallback} (set CNPGEN_CACHE to a writable folder)",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -171,4 +175,3 @@ def _try_compiler(folder: Path) -> None:
     (result,) = kernel(np.arange(5.0)[None])
     if not np.array_equal(result[0], 2 * np.arange(5.0)):
         raise MachineError("the C compiler makes wrong code: 2 x differs from x + x")
-

@@ -22,8 +22,8 @@ CODES = {name: code for code, name in enumerate(NAMES)}
 class Loop:
     """Repeat the tape on each lane until its error is small: ``x, error = tape(x, parameters...)``.
 
-    The first input of the tape is the state, its first output the next state and its second output the error of the state that
-    it was given. A lane whose error is below ``tolerance`` takes that last step and is then frozen.
+    The first input of the tape is the state, its first output the next state and its second output the error of the
+    state that it was given. A lane whose error is below ``tolerance`` takes that last step and is then frozen.
 
     Attributes:
         tolerance: A lane has converged when its error is below this.
@@ -38,8 +38,8 @@ class Loop:
 class Tape:
     """A straight-line program on float64 scalars.
 
-    Instruction k computes value k. ``INPUT`` has a = argument, b = component; ``OUTPUT`` has a = value, b = argument and
-    ``constant`` = component; every other operation has a, b = operand values.
+    Instruction k computes value k. ``INPUT`` has a = argument, b = component; ``OUTPUT`` has a = value, b = argument
+    and ``constant`` = component; every other operation has a, b = operand values.
 
     Attributes:
         name: A C identifier.
@@ -68,7 +68,12 @@ class Tape:
         """Serialize; equal tapes give equal bytes."""
         buffer = io.BytesIO()
         loop = [self.loop.tolerance, float(self.loop.limit)] if self.loop else []
-        header = [np.frombuffer(self.name.encode(), np.uint8), np.array(self.inputs), np.array(self.outputs), np.array(loop)]
+        header = [
+            np.frombuffer(self.name.encode(), np.uint8),
+            np.array(self.inputs),
+            np.array(self.outputs),
+            np.array(loop),
+        ]
         for array in (*header, self.operation, self.a, self.b, self.constant):
             np.save(buffer, array, allow_pickle=False)
         return buffer.getvalue()
@@ -86,7 +91,9 @@ class Tape:
         except (EOFError, OSError) as error:
             raise ValueError(f"damaged tape: {error}") from error
         iteration = Loop(float(loop[0]), int(loop[1])) if len(loop) else None
-        return cls(bytes(name).decode(), tuple(inputs.tolist()), tuple(outputs.tolist()), *program, iteration)
+        operation, a, b, constant = program
+        widths = tuple(inputs.tolist()), tuple(outputs.tolist())
+        return cls(bytes(name).decode(), *widths, operation, a, b, constant, iteration)
 
 
 def tape_from_function(function: Any, loop: Loop | None = None) -> Tape:

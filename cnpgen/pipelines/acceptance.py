@@ -25,14 +25,17 @@ def acceptance(context: Context, written: set[str]) -> Run:
 
     Args:
         context: The surroundings.
-        written: Columns that the stages write; accelerations and torques of the goal are checked if its acceleration is known.
+        written: Columns that the stages write; accelerations and torques of the goal are checked if its acceleration
+            is known.
 
     Returns:
         A function that rejects, under each constraint's reason, what is not exactly a boundary problem.
     """
     ends: tuple[End, ...] = ("start", "goal")
     kernels = {
-        end: context.kernels.load(boundary_excess, end=end, needs=2 if f"{end}_ddq" in written else 1, dtype=context.dtype)
+        end: context.kernels.load(
+            boundary_excess, end=end, needs=2 if f"{end}_ddq" in written else 1, dtype=context.dtype
+        )
         for end in ends
     }
     hitting = context.kernels.load(direction_excess, dtype=context.dtype) if "hit_angle" in written else None
@@ -122,6 +125,8 @@ def direction_excess(robot: "Robot", *, dtype: str) -> Any:
 def bookkeeping_fields() -> tuple[Field, ...]:
     """The fields that every dataset has."""
     return (
-        Field("attempts", "1", "draws that it took to find this row, itself included", role="diagnostic", dtype="int64"),
+        Field(
+            "attempts", "1", "draws that it took to find this row, itself included", role="diagnostic", dtype="int64"
+        ),
         Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
     )

@@ -1,7 +1,10 @@
-"""Stage: can the arm brake before the edge of the table? A roll-out of full braking, forwards from the start, backwards from the goal.
+"""Stage: can the arm brake before the edge of the table? A roll-out of full braking from both ends.
 
-Each step of 10 ms takes the accelerations that slow the tip down most along the edge's normal, within the acceleration and velocity
-limits and on the manifold: a linear programme with one equality (a continuous knapsack). Reversed in time, the goal is a start.
+Forwards in time from the start, backwards from the goal.
+
+Each step of 10 ms takes the accelerations that slow the tip down most along the edge's normal, within the
+acceleration and velocity limits and on the manifold: a linear programme with one equality (a continuous knapsack).
+Reversed in time, the goal is a start.
 """
 
 from dataclasses import dataclass
@@ -38,8 +41,9 @@ class BrakingReach(Stage):
     def describe(self) -> str:
         """Say what is kept."""
         return (
-            f"require that full braking ends less than {1e3 * self.margin:g} mm beyond every edge of the table, from the start forwards"
-            " and from the goal backwards in time (loses about 0.15 % of the solvable problems, where the ballistic rule loses 13.7 %)"
+            f"require that full braking ends less than {1e3 * self.margin:g} mm beyond every edge of the table, from"
+            " the start forwards and from the goal backwards in time (loses about 0.15 % of the solvable problems,"
+            " where the ballistic rule loses 13.7 %)"
         )
 
     def provides(self, context: Context) -> tuple[Field, ...]:
@@ -99,10 +103,10 @@ def tip_state(robot: "Robot") -> Any:
 
 
 def braking_step(robot: "Robot", *, height: float) -> Any:
-    """Build one step of braking as an SX function ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
+    """Build one step of braking: ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
 
-    ``still running`` is 1 until the tip stops moving along the normal within the step; ``overshoot`` is then how far beyond
-    ``n . p = edge`` it is [m].
+    ``still running`` is 1 until the tip stops moving along the normal within the step; ``overshoot`` is then how far
+    beyond ``n . p = edge`` it is [m].
 
     Args:
         robot: The robot.
@@ -144,8 +148,9 @@ def _acceleration_box(robot: "Robot", dq: Vec) -> tuple[Vec, Vec]:
 def _knapsack(c: Vec, a: Vec, target: Scalar, low: Vec, high: Vec) -> Vec:
     """Maximise ``c . x`` subject to ``a . x = target`` and ``low <= x <= high``.
 
-    All but one x sit on a bound, chosen by the sign of ``c - lambda a`` with lambda = c_i / a_i for the one in between: of the n
-    candidates the one that violates its own bounds least is the optimum (by nothing, where there is one).
+    All but one x sit on a bound, chosen by the sign of ``c - lambda a`` with lambda = c_i / a_i for the one in
+    between: of the n candidates the one that violates its own bounds least is the optimum (by nothing, where there is
+    one).
     """
     import casadi as ca
 

@@ -1,8 +1,8 @@
 """Stage: collisions of the arm and the held object with the boxes of the world, judged by Coal on both ends.
 
-An exact test of every capsule's segment against every box comes first and rejects almost all collisions cheaply; Coal then judges
-every sample that is left. The boxes move with the sample, so each becomes a sliding joint of the Pinocchio model: one call checks a
-whole batch without any Python per sample.
+An exact test of every capsule's segment against every box comes first and rejects almost all collisions cheaply; Coal
+then judges every sample that is left. The boxes move with the sample, so each becomes a sliding joint of the
+Pinocchio model: one call checks a whole batch without any Python per sample.
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,9 @@ class Collision(Stage):
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             for end in self._ends():
-                (distance,) = kernel(batch[f"{end}_q"], obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"]))
+                (distance,) = kernel(
+                    batch[f"{end}_q"], obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
+                )
                 batch[f"{end}_clearance"] = distance - radius
                 batch.reject(distance[0] > radius, f"arm in collision at the {end}")
 
@@ -78,7 +80,9 @@ class Collision(Stage):
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             tops = obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
-            hit = judge(np.concatenate([batch[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends())))
+            hit = judge(
+                np.concatenate([batch[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends()))
+            )
             batch.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
 
         return run
@@ -101,8 +105,8 @@ def skeleton_distance(robot: "Robot", problem: Problem) -> Any:
 def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) -> Any:
     """Return a function ``(q (n, N), tops (obstacles, N)) -> collides (N,)`` that asks Coal.
 
-    The held object is made smaller by ``depth`` on every side: the contact that is legal does not count, and the touching pair,
-    the slowest case of Coal's algorithms, becomes a clear one.
+    The held object is made smaller by ``depth`` on every side: the contact that is legal does not count, and the
+    touching pair, the slowest case of Coal's algorithms, becomes a clear one.
     """
     import coal
     import pinocchio as pin

@@ -38,7 +38,9 @@ class Context:
         for constraint in self.problem.constraint:
             if isinstance(constraint, kind):
                 return constraint
-        raise RecipeError([f"{self.problem.path}: stage {stage!r} needs a constraint {kind.__name__!r}, the problem has none"])
+        raise RecipeError(
+            [f"{self.problem.path}: stage {stage!r} needs a constraint {kind.__name__!r}, the problem has none"]
+        )
 
     def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:
         """Describe a field with one column per planned joint, bounded by the planning limits of its unit."""

@@ -15,8 +15,8 @@ from cnpgen.schema import Range, field
 class DrawPositions(Stage):
     """Start and goal position uniform in two boxes, at least ``min_distance`` apart."""
 
-    start: tuple[Range, ...] = field("box of start positions: x, y, z", unit="m")
-    goal: tuple[Range, ...] = field("box of goal positions: x, y, z", unit="m")
+    start: tuple[Range, Range, Range] = field("box of start positions: x, y, z", unit="m")
+    goal: tuple[Range, Range, Range] = field("box of goal positions: x, y, z", unit="m")
     min_distance: float = field("smallest horizontal distance between the two", unit="m", default=0.0, low=0.0)
 
     def describe(self) -> str:
@@ -58,9 +58,6 @@ class DrawPositions(Stage):
         mistakes = []
         shoulder = context.robot.chain.joints[0].translation
         for end, box in (("start", self.start), ("goal", self.goal)):
-            if len(box) != 3:
-                mistakes.append(f"draw-positions: {end}: needs three ranges (x, y, z), got {len(box)}")
-                continue
             nearest = np.clip(shoulder, [axis.low for axis in box], [axis.high for axis in box])
             distance = float(np.linalg.norm(nearest - shoulder))
             if distance > context.robot.chain.reach:
@@ -76,7 +73,8 @@ def uniform(numbers: Array, ranges: tuple[Range, ...]) -> Array:
     """Scale uniform numbers of shape (m, n) to m ranges."""
     low = np.array([[r.low] for r in ranges])
     high = np.array([[r.high] for r in ranges])
-    return low + (high - low) * numbers
+    scaled: Array = low + (high - low) * numbers
+    return scaled
 
 
 def _box(ranges: tuple[Range, ...]) -> str:

@@ -26,12 +26,13 @@ class HitAngleToGoal(Stage):
     """Towards a point behind the goal position, with uniform noise."""
 
     needs = ("goal_xyz",)
-    target: tuple[float, ...] = field("where the puck is sent: x, y", unit="m")
+    target: tuple[float, float] = field("where the puck is sent: x, y", unit="m")
     noise: float = field("largest deviation to either side", unit="rad", default=0.0, low=0.0, high=np.pi)
 
     def describe(self) -> str:
         """Say where to."""
-        return f"aim from the goal position at ({self.target[0]:g}, {self.target[1]:g}) m, plus uniform noise of +-{self.noise:g} rad"
+        x, y = self.target
+        return f"aim from the goal position at ({x:g}, {y:g}) m, plus uniform noise of +-{self.noise:g} rad"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The angle."""

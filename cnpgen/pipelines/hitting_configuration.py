@@ -1,11 +1,12 @@
 """The hitting configuration: the joint positions at the puck from which the mallet can move fastest along the hit.
 
-Maximise ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d`` is the unit
-hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the configuration that the search stays
-close to, ``L`` the rated joint velocities. Solved by Newton's method on the optimality conditions, in closed form:
-``d^2 p / dq_j dq_k = z_min(j,k) x J_max(j,k)``, hence gradient ``2 A a`` with ``a = J^T d`` and ``A_jk = d . (z_min x J_max)``, and
-Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)`` with ``dz``, ``dJ`` the derivatives along ``a``. The constraint is
-eliminated through three basic joints, so that each step factorizes only a (n - 3) x (n - 3) matrix.
+Maximise ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d``
+is the unit hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the
+configuration that the search stays close to, ``L`` the rated joint velocities. Solved by Newton's method on the
+optimality conditions, in closed form: ``d^2 p / dq_j dq_k = z_min(j,k) x J_max(j,k)``, hence gradient ``2 A a`` with
+``a = J^T d`` and ``A_jk = d . (z_min x J_max)``, and Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)`` with
+``dz``, ``dJ`` the derivatives along ``a``. The constraint is eliminated through three basic joints, so that each step
+factorizes only a (n - 3) x (n - 3) matrix.
 """
 
 from dataclasses import dataclass
@@ -58,7 +59,9 @@ class HittingConfiguration(Stage):
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
-            home = batch["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], len(batch.alive), axis=1)
+            home = (
+                batch["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], len(batch.alive), axis=1)
+            )
             guess, error = first(home, batch["goal_xyz"])
             direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
             q, step = newton(guess, batch["goal_xyz"], direction, home)
@@ -92,13 +95,13 @@ def newton_step(robot: "Robot") -> Any:
     gain = [d[0] * column[0] + d[1] * column[1] for column in kin.jacobian]
     second = _second_derivatives(kin)
     slope = [[d[0] * second[j][k][0] + d[1] * second[j][k][1] for k in range(robot.n)] for j in range(robot.n)]
-    gradient = [
-        2.0 * dot(slope[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)
-    ]
+    gradient = [2.0 * dot(slope[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
     inverse = inverse3([kin.jacobian[j] for j in basic])
     multiplier = [dot([inverse[b][row] for b in range(3)], [gradient[j] for j in basic]) for row in range(3)]
-    hessian = _lagrangian_hessian(kin, gain, direction, slope, multiplier, weight, second)
-    step = _null_space_step(kin, gradient, hessian, inverse, subtract(p, kin.tip), basic, free)
+    hessian = _lagrangian_hessian(
+        kin, gain, direction, slope=slope, multiplier=multiplier, weight=weight, second=second
+    )
+    step = _null_space_step(kin, gradient, hessian, inverse=inverse, miss=subtract(p, kin.tip), basic=basic, free=free)
     length = ca.sqrt(dot(step, step))
     factor = ca.fmin(1.0, MAX_STEP / ca.fmax(length, 1e-12))
     following = ca.vertcat(*add(q, scale(step, factor)))
@@ -106,7 +109,7 @@ def newton_step(robot: "Robot") -> Any:
 
 
 def basic_joints(robot: "Robot") -> tuple[int, int, int]:
-    """Choose the three joints through which the tip position is eliminated: the largest smallest |det J_B| near the base."""
+    """Choose the joints through which the tip position is eliminated: largest least |det J_B| near the base."""
     random = np.random.default_rng(0)
     low, high = np.maximum(robot.base - 0.7, robot.position_lower), np.minimum(robot.base + 0.7, robot.position_upper)
     jacobians = [_numeric_jacobian(robot.chain, random.uniform(low, high)) for _ in range(64)]
@@ -133,7 +136,14 @@ def _second_derivatives(kin: Kinematics) -> list[list[Vec]]:
 
 
 def _lagrangian_hessian(
-    kin: Kinematics, gain: Vec, direction: Vec, slope: list[Vec], multiplier: Vec, weight: Vec, second: list[list[Vec]]
+    kin: Kinematics,
+    gain: Vec,
+    direction: Vec,
+    *,
+    slope: list[Vec],
+    multiplier: Vec,
+    weight: Vec,
+    second: list[list[Vec]],
 ) -> list[list[Scalar]]:
     """Hessian of ``f - multiplier . FK``, full symmetric n x n."""
     n = len(kin.axes)
@@ -163,7 +173,14 @@ def _lagrangian_hessian(
 
 
 def _null_space_step(
-    kin: Kinematics, gradient: Vec, hessian: list[list[Scalar]], inverse: list[Vec], miss: Vec, basic: tuple[int, ...], free: list[int]
+    kin: Kinematics,
+    gradient: Vec,
+    hessian: list[list[Scalar]],
+    *,
+    inverse: list[Vec],
+    miss: Vec,
+    basic: tuple[int, ...],
+    free: list[int],
 ) -> Vec:
     """Newton step: basic joints close the miss, free joints climb the reduced gradient."""
     import casadi as ca

@@ -1,12 +1,13 @@
 """Stage: the fastest joint velocity along the hit, a linear programme solved exactly.
 
-Maximise ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the tip's velocity along the hit and ``b_i`` its
-two components across it per unit of joint i. The dual, ``min over y in R^2 of sum_i L_i |a_i - b_i . y|``, has its minimum where two
-residuals vanish: n (n - 1) / 2 candidates, evaluated without branches. Joints with non-zero residual go to the limit of its sign.
+Maximise ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the tip's velocity along the hit
+and ``b_i`` its two components across it per unit of joint i. The dual, ``min over y in R^2 of sum_i L_i |a_i - b_i .
+y|``, has its minimum where two residuals vanish: n (n - 1) / 2 candidates, evaluated without branches. Joints with
+non-zero residual go to the limit of its sign.
 
-In half of the poses of an arm with intersecting axes three or more residuals vanish together and the optimum is a face. The
-joints left are then given the velocity ``v_i = t L_i sign(b_i . z)`` of smallest t that closes the equations: again a linear
-programme, whose dual has its optimum at a ``z`` orthogonal to one of the b_i.
+In half of the poses of an arm with intersecting axes three or more residuals vanish together and the optimum is a
+face. The joints left are then given the velocity ``v_i = t L_i sign(b_i . z)`` of smallest t that closes the
+equations: again a linear programme, whose dual has its optimum at a ``z`` orthogonal to one of the b_i.
 """
 
 from dataclasses import dataclass
@@ -34,12 +35,16 @@ class HittingVelocity(Stage):
     """Joint velocities of the goal: along the hit exactly, as fast as possible or scaled down."""
 
     needs = ("goal_q", "hit_angle")
-    full_speed: float = field("fraction of the hits at the highest possible speed; the others are scaled", low=0.0, high=1.0)
+    full_speed: float = field(
+        "fraction of the hits at the highest possible speed; the others are scaled", low=0.0, high=1.0
+    )
     min_speed: float = field("hits that cannot be faster than this are rejected", unit="m/s", default=1e-3, low=1e-9)
 
     def describe(self) -> str:
         """Say how fast."""
-        slower = f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
+        slower = (
+            f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
+        )
         return f"solve the linear programme for the fastest joint velocity along the hit{slower}"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
@@ -47,7 +52,13 @@ class HittingVelocity(Stage):
         return (
             context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
             Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
-            Field("hit_speed_max", "m/s", "highest possible speed along the hit at the goal configuration", role="diagnostic", frame="world"),
+            Field(
+                "hit_speed_max",
+                "m/s",
+                "highest possible speed along the hit at the goal configuration",
+                role="diagnostic",
+                frame="world",
+            ),
         )
 
     def prepare(self, context: Context) -> Run:
@@ -141,14 +152,20 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     ratio = ca.fmax(ratio, 0.0)
     length = ca.sqrt(dot(pivot, pivot))
     parallel = [ca.fabs(dot(x, z)) <= PARALLEL * length * ca.sqrt(dot(x, x)) for x in b]
-    v = [ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z))) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    v = [
+        ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z)))
+        for same, bound, x in zip(parallel, limit, b, strict=True)
+    ]
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
     shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
     total: Scalar = 0.0
     for share in shares:
         total = total + ca.fabs(share)
     amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
-    along = [ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    along = [
+        ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0)
+        for same, bound, x in zip(parallel, limit, b, strict=True)
+    ]
     return [x + w for x, w in zip(v, along, strict=True)]
 
 

@@ -102,8 +102,8 @@ class GoalIK(_IK):
 def ik_step(robot: "Robot", *, vertical: bool, max_step: float) -> Any:
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
-    A joint that the step would carry beyond its limit is put on the limit and the rest of the step is redistributed over the
-    others, once.
+    A joint that the step would carry beyond its limit is put on the limit and the rest of the step is redistributed
+    over the others, once.
 
     Args:
         robot: The robot.
@@ -141,7 +141,9 @@ def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
 
     up = [row[2] for row in kin.rotation]
     stretch = 2.0 / ca.fmax(1.0 + up[2], 1e-3)
-    rows = [[axis[row] if turns else 0.0 for axis, turns in zip(kin.axes, kin.turning, strict=True)] for row in range(2)]
+    rows = [
+        [axis[row] if turns else 0.0 for axis, turns in zip(kin.axes, kin.turning, strict=True)] for row in range(2)
+    ]
     return [up[1] * stretch, -up[0] * stretch], rows
 
 

@@ -58,7 +58,7 @@ class AtRest(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class TableVelocity(Stage):
-    """A random start velocity with ``J_z dq = 0``: a uniform direction in the box of the limits, projected, at uniform length."""
+    """A random start velocity with ``J_z dq = 0``: a direction in the box of the limits, at uniform length."""
 
     needs = ("start_q",)
     at_rest: float = field("fraction of the starts that are at rest", low=0.0, high=1.0, default=0.0)
@@ -103,7 +103,9 @@ class TableAcceleration(Stage):
 
     def describe(self) -> str:
         """Say where."""
-        return f"draw an acceleration of the {self.end} on the table manifold, within the acceleration and torque limits"
+        return (
+            f"draw an acceleration of the {self.end} on the table manifold, within the acceleration and torque limits"
+        )
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The acceleration."""
@@ -126,8 +128,8 @@ class TableAcceleration(Stage):
 def table_velocity(robot: "Robot") -> Any:
     """Build ``(q, direction, length) -> (dq, tip velocity)`` with ``J_z dq = 0``.
 
-    The direction, in units of the limits, is projected on the manifold under the metric of the limits, stretched until the
-    first joint meets its limit, and multiplied by the length in [0, 1).
+    The direction, in units of the limits, is projected on the manifold under the metric of the limits, stretched
+    until the first joint meets its limit, and multiplied by the length in [0, 1).
 
     Args:
         robot: The robot.
@@ -148,9 +150,9 @@ def table_velocity(robot: "Robot") -> Any:
 def table_acceleration(robot: "Robot") -> Any:
     """Build ``(q, dq, direction, length) -> (ddq, room)`` with ``J_z ddq + dJ_z dq = 0``.
 
-    ``ddq = particular + t * projected direction`` with the particular solution of least weighted maximum norm. Torque is affine in
-    t (two inverse dynamics), so every limit is an interval of t; t is uniform in their intersection. ``room`` is its length,
-    negative where the particular solution itself is outside a limit.
+    ``ddq = particular + t * projected direction`` with the particular solution of least weighted maximum norm. Torque
+    is affine in t (two inverse dynamics), so every limit is an interval of t; t is uniform in their intersection.
+    ``room`` is its length, negative where the particular solution itself is outside a limit.
 
     Args:
         robot: The robot.
@@ -176,7 +178,7 @@ def table_acceleration(robot: "Robot") -> Any:
     low, high = _interval([*particular, *torque], [*direction, *change], bounds)
     t = low + s[0] * (high - low)
     ddq = add(particular, scale(direction, t))
-    admissible = ca.logic_and(low <= 0, 0 <= high)
+    admissible = ca.logic_and(low <= 0, high >= 0)
     room = ca.if_else(admissible, high - low, -1.0)
     return ca.Function("table_acceleration", [q_sx, dq_sx, u_sx, s_sx], [ca.vertcat(*ddq), room])
 

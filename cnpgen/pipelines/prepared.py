@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
 from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.kernels.library import Backend, KernelLibrary
@@ -28,7 +27,8 @@ FAIR_CHANCE = 100_000  # draws
 
 # Stored order of the fields that the shipped stages write; others follow in the order of their stages.
 ORDER = (
-    "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq", "start_xyz", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_max",
+    "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq", "start_xyz", "goal_xyz",
+    "hit_angle", "hit_speed", "hit_speed_max",
 )  # fmt: skip
 
 
@@ -70,31 +70,35 @@ class PreparedPipeline:
         self._stages: list[Run] = [stage.prepare(self.context) for stage in pipeline.stage]
         self._accept = acceptance(self.context, written)
 
-    def block(self, seed: int, split: str, index: int, rows: int = BLOCK_ROWS) -> Block:
-        """Make the first ``rows`` rows of one block.
+    def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int = BLOCK_ROWS) -> Block:
+        """Make rows ``first`` to ``stop`` of one block.
 
         Args:
             seed: Root seed of the dataset.
             split: Name of the split.
             index: Index of the block in the split.
-            rows: How many rows; fewer rows are the first of the whole block.
+            first: First row wanted.
+            stop: One after the last row wanted, at most ``BLOCK_ROWS``.
 
         Raises:
             RecipeError: Practically no draw is accepted.
         """
         random = random_generator(seed, split, index)
-        tally = Tally(self.fields)
-        parts: list[dict[str, NDArray[Any]]] = []
-        while tally.accepted < rows:
-            batch = self._round(random, _round_size(tally))
-            taken = batch.alive[: rows - tally.accepted]
-            full = tally.accepted + len(taken) == rows
-            attempts = tally.count(batch, int(taken[-1]) + 1 if full else batch.size, taken)
-            part = {field.name: batch[field.name][:, : len(taken)] for field in self.fields[:-2]}
-            parts.append({**part, "attempts": attempts[None]})
-            self._check_hope(tally)
+        tally, parts = Tally(self.fields), []
+        made = tried = 0
+        while made < stop:
+            batch = self._round(random, _round_size(made, tried))
+            tried += batch.size
+            taken = batch.alive[: stop - made]
+            skip = min(max(first - made, 0), len(taken))
+            made += len(taken)
+            if made > first or first == 0:
+                attempts = tally.count(batch, taken, first=skip, last=made == stop)
+                part = {field.name: batch[field.name][:, skip : len(taken)] for field in self.fields[:-2]}
+                parts.append({**part, "attempts": attempts[None]})
+            self._check_hope(batch, made, tried)
         columns = {name: np.concatenate([part[name] for part in parts], axis=1) for name in parts[0]}
-        columns["sample_id"] = index * BLOCK_ROWS + np.arange(rows, dtype=np.int64)[None]
+        columns["sample_id"] = index * BLOCK_ROWS + np.arange(first, stop, dtype=np.int64)[None]
         return Block(columns, tally.outcome())
 
     def _round(self, random: np.random.Generator, size: int) -> Batch:
@@ -108,13 +112,13 @@ class PreparedPipeline:
         self._accept(batch, random)
         return batch
 
-    def _check_hope(self, tally: Tally) -> None:
-        if tally.tried >= FAIR_CHANCE and tally.accepted < HOPELESS * tally.tried:
-            outcome = tally.outcome()
-            worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]
-            reasons = ", ".join(f"{reason}: {count}" for reason, count in worst)
+    def _check_hope(self, batch: Batch, made: int, tried: int) -> None:
+        if tried >= FAIR_CHANCE and made < HOPELESS * tried:
+            counts = np.bincount(batch.fate, minlength=1 + len(batch.reasons))[1:]
+            worst = sorted(zip(counts.tolist(), batch.reasons, strict=True), reverse=True)[:3]
+            reasons = ", ".join(f"{reason} ({count / batch.size:.0%})" for count, reason in worst)
             raise RecipeError(
-                [f"{self.pipeline.path}: {outcome.accepted} of {outcome.tried} draws were accepted; rejected mostly for {reasons}"]
+                [f"{self.pipeline.path}: {made} of {tried} draws were accepted; rejected mostly for: {reasons}"]
             )
 
 
@@ -136,13 +140,16 @@ def as_stored(values: Array, field: Field) -> Array:
     return rounded.astype(np.float64)
 
 
-def _round_size(tally: Tally) -> int:
-    """How many draws the next round has: what the block's own acceptance so far says is missing, and a little more."""
-    if tally.tried == 0:
+def _round_size(made: int, tried: int) -> int:
+    """How many draws the next round of a block has: what its own acceptance so far says is missing, and a little more.
+
+    It depends on the block alone and not on how many of its rows are wanted.
+    """
+    if tried == 0:
         return BLOCK_ROWS // 2
-    if tally.accepted == 0:
+    if made == 0:
         return LARGEST_ROUND
-    missing = (BLOCK_ROWS - tally.accepted) * tally.tried / tally.accepted
+    missing = (BLOCK_ROWS - made) * tried / made
     return int(np.clip(np.ceil(1.03 * missing) + 32, SMALLEST_ROUND, LARGEST_ROUND))
 
 
@@ -157,20 +164,23 @@ def _ordered_fields(pipeline: Pipeline, context: Context) -> tuple[Field, ...]:
 
 
 def _check_needs(pipeline: Pipeline, context: Context) -> set[str]:
-    """Return the columns that the stages write; raise RecipeError where a stage needs one that none before it writes."""
+    """Return the columns that the stages write; raise RecipeError where a stage needs one that is not there."""
     written: set[str] = set()
     mistakes = []
     for number, stage in enumerate(pipeline.stage, start=1):
         missing = [name for name in stage.needs if name not in written]
         if missing:
             mistakes.append(
-                f"{pipeline.path}: stage {number} ({type(stage).__name__}) needs {', '.join(missing)}, which no stage before it writes"
+                f"{pipeline.path}: stage {number} ({type(stage).__name__}) needs {', '.join(missing)},"
+                " which no stage before it writes"
             )
         written.update(stage.writes(context))
     needed = ("start_q", "start_dq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
-    mistakes.extend(f"{pipeline.path}: no stage writes {name}, which every sample must have" for name in needed if name not in written)
+    mistakes.extend(
+        f"{pipeline.path}: no stage writes {name}, which every sample must have"
+        for name in needed
+        if name not in written
+    )
     if mistakes:
         raise RecipeError(mistakes)
     return written
-
-

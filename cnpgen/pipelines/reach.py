@@ -59,7 +59,8 @@ class BallisticReach(Stage):
 def over(table: Table, position: Array) -> NDArray[np.bool_]:
     """Whether positions of shape (2 or 3, n) [m] are over the table's rectangle."""
     x, y = position[:2]
-    return (table.x.low <= x) & (x <= table.x.high) & (table.y.low <= y) & (y <= table.y.high)
+    inside: NDArray[np.bool_] = (table.x.low <= x) & (x <= table.x.high) & (table.y.low <= y) & (y <= table.y.high)
+    return inside
 
 
 def hit_velocity(batch: Batch) -> Array:

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +47,11 @@ class Batch:
             self.drawn[name] = values
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
-        """Draw uniform numbers in [0, 1) for every draw of the round and return those of the survivors, shape (width, n)."""
+        """Draw uniform numbers in [0, 1) for every draw of the round; return the survivors', shape (width, n)."""
         numbers = random.random((width, self.size))
         return numbers if len(self.alive) == self.size else np.take(numbers, self.alive, axis=1)
 
-    def reject(self, ok: NDArray[np.bool_], reason: str) -> None:
+    def reject(self, ok: Any, reason: str) -> None:
         """End the draws where ``ok`` (shape (n,)) is false under ``reason`` and drop them from every column."""
         if reason not in self.reasons:
             self.reasons.append(reason)
@@ -70,8 +70,8 @@ Run = Callable[[Batch, np.random.Generator], None]
 class Stage(ABC):
     """One step of a pipeline.
 
-    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table; it is registered under a name
-    in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.stages``.
+    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table; it is registered under
+    a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.stages``.
 
     Attributes:
         needs: Columns that earlier stages must have written.
@@ -99,5 +99,6 @@ class Stage(ABC):
             context: The problem, its robot and the kernel loader.
 
         Returns:
-            A function of (batch, random) that writes columns and rejects draws. It must use ``batch.draw`` for randomness.
+            A function of (batch, random) that writes columns and rejects draws. It must use ``batch.draw`` for
+            randomness.
         """

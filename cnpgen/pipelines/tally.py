@@ -30,23 +30,34 @@ class Tally:
         self._drawn = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
         self._kept = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
 
-    def count(self, batch: Batch, draws: int, taken: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Count the first ``draws`` draws of a finished round, of which ``taken`` (ascending) became rows.
+    def count(self, batch: Batch, taken: NDArray[np.intp], *, first: int, last: bool) -> NDArray[np.int64]:
+        """Count the draws of a finished round that belong to the rows asked for.
+
+        Args:
+            batch: The round.
+            taken: Its draws that became rows, ascending.
+            first: How many of these rows come before the first row asked for; they and their draws are not counted.
+            last: Whether the last of ``taken`` is the last row asked for: what was drawn after it is not counted.
 
         Returns:
-            For every row the number of draws that it took, itself included, shape (len(taken),).
+            For every row counted the number of draws that it took, itself included.
         """
-        fates = np.bincount(batch.fate[:draws], minlength=1 + len(batch.reasons))
+        wanted = taken[first:]
+        start = int(taken[first - 1]) + 1 if first else 0
+        stop = int(taken[-1]) + 1 if last else batch.size
+        if first:
+            self._waiting = 0
+        fates = np.bincount(batch.fate[start:stop], minlength=1 + len(batch.reasons))
         for reason, number in zip(batch.reasons, fates[1:].tolist(), strict=True):
             self._rejections[reason] = self._rejections.get(reason, 0) + number
-        self.tried += draws
-        self.accepted += len(taken)
+        self.tried += stop - start
+        self.accepted += len(wanted)
         for field in self._maps:
             cells = _cells(batch.drawn[field.name], field)
-            self._drawn[field.name] += np.bincount(cells[:draws], minlength=CELLS * CELLS)
-            self._kept[field.name] += np.bincount(cells[taken], minlength=CELLS * CELLS)
-        attempts = np.diff(taken, prepend=-1 - self._waiting).astype(np.int64)
-        self._waiting = draws - 1 - int(taken[-1]) if len(taken) else self._waiting + draws
+            self._drawn[field.name] += np.bincount(cells[start:stop], minlength=CELLS * CELLS)
+            self._kept[field.name] += np.bincount(cells[wanted], minlength=CELLS * CELLS)
+        attempts = np.diff(wanted, prepend=start - 1 - self._waiting).astype(np.int64)
+        self._waiting = stop - 1 - int(wanted[-1]) if len(wanted) else self._waiting + stop - start
         return attempts
 
     def outcome(self) -> Outcome:

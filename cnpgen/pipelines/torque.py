@@ -28,7 +28,9 @@ class GravityTorque(Stage):
 
     def describe(self) -> str:
         """Say where."""
-        return f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
+        return (
+            f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
+        )
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The largest torque as a fraction of its limit."""

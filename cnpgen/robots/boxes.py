@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cnpgen.robots.linalg import Scalar
+from cnpgen.robots.linalg import Scalar, dot
 from cnpgen.robots.symbolic import Vec
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
@@ -11,8 +11,9 @@ Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has n
 def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
     """Distance from a segment to an axis-aligned box [m], 0 where they touch.
 
-    ``d^2`` of the point ``first + t (second - first)`` is convex in t and its derivative is piecewise linear with a knot where a
-    coordinate meets a face. The knots bracket the minimum; between the two nearest the derivative is linear.
+    ``d^2`` of the point ``first + t (second - first)`` is convex in t and its derivative is piecewise linear with a
+    knot where a coordinate meets a face. The knots bracket the minimum; between the two nearest the derivative is
+    linear.
 
     Args:
         first: One end [m].
@@ -35,10 +36,10 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
         slope = _slope(first, along, box, knot)
         falls = ca.logic_and(slope <= 0, low < knot)
         low, slope_low = ca.if_else(falls, knot, low), ca.if_else(falls, slope, slope_low)
-        rises = ca.logic_and(0 <= slope, knot < high)
+        rises = ca.logic_and(slope >= 0, knot < high)
         high, slope_high = ca.if_else(rises, knot, high), ca.if_else(rises, slope, slope_high)
     fraction = ca.fmax(ca.fmin(-slope_low / ca.fmax(slope_high - slope_low, 1e-300), 1), 0)
-    t = ca.if_else(0 <= start, 0, ca.if_else(end <= 0, 1, low + fraction * (high - low)))
+    t = ca.if_else(start >= 0, 0, ca.if_else(end <= 0, 1, low + fraction * (high - low)))
     outside = [_outside(first[axis] + t * along[axis], box[axis]) for axis in range(3)]
     return ca.sqrt(sum(x * x for x in outside))
 
@@ -61,10 +62,11 @@ def _slope(first: Vec, along: Vec, box: Bounds, t: Scalar) -> Scalar:
 
 
 def upright_box_separation(centre: Vec, rotation: list[Vec], size: tuple[float, float, float], box: Bounds) -> Scalar:
-    """Separation of a cuboid from an axis-aligned box along the best face normal [m]; negative is the depth of penetration.
+    """Separation of a cuboid from an axis-aligned box along the best face normal [m]; negative inside.
 
-    Exact for a cuboid whose z axis is vertical (its faces' normals and the box's are then all the separating axes that there
-    are); a lower bound of the distance otherwise.
+    Exact for a cuboid whose z axis is vertical and that overlaps the box (its faces' normals and the box's are then all
+    the separating axes that there are). A lower bound of the distance where they are apart and, up to terms of the
+    order of the depth of penetration times tilt^2, where the cuboid is tilted.
 
     Args:
         centre: Centre of the cuboid [m].
@@ -85,8 +87,10 @@ def upright_box_separation(centre: Vec, rotation: list[Vec], size: tuple[float, 
     middle = [(low + high) / 2 for low, high in box[:2]]
     extent = [(high - low) / 2 for low, high in box[:2]]
     for i in range(2):
-        shift = sum((centre[axis] - middle[axis]) * rotation[axis][i] for axis in range(2))
-        spread = half[i] + sum(extent[axis] * ca.fabs(rotation[axis][i]) for axis in range(2))
+        normal = [rotation[axis][i] for axis in range(2)]  # its horizontal part: all of it if the cuboid is upright
+        shift = sum((centre[axis] - middle[axis]) * normal[axis] for axis in range(2))
+        own = sum(half[j] * ca.fabs(dot(normal, [rotation[0][j], rotation[1][j]])) for j in range(3))
+        spread = own + sum(extent[axis] * ca.fabs(normal[axis]) for axis in range(2))
         gaps.append(ca.fabs(shift) - spread)
     best = gaps[0]
     for gap in gaps[1:]:

@@ -70,14 +70,18 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     for index in range(1, model.njoints):
         kind = model.joints[index].shortname()
         if model.joints[index].nq != 1 or model.joints[index].nv != 1:
-            raise RecipeError([f"{model.names[index]}: joints of type {kind} are not supported, only revolute and prismatic ones"])
+            raise RecipeError(
+                [f"{model.names[index]}: joints of type {kind} are not supported, only revolute and prismatic ones"]
+            )
         if model.parents[index] != index - 1:
             raise RecipeError([f"{model.names[index]}: the planned joints do not form one serial chain"])
     frame = model.frames[model.getFrameId(tip)]
     if frame.parentJoint != model.njoints - 1:
         raise RecipeError([f"tip frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
     joints = tuple(_joint(model, data, index) for index in range(1, model.njoints))
-    return Chain(joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear))
+    return Chain(
+        joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear)
+    )
 
 
 def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:

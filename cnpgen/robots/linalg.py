@@ -42,7 +42,9 @@ def gram(rows: Matrix, damping: float = 0.0) -> list[list[Scalar]]:
     return [[dot(rows[i], rows[j]) + (damping if i == j else 0.0) for j in range(i + 1)] for i in range(m)]
 
 
-def factorize(lower: Matrix, safeguard: Callable[[Scalar], Scalar] | None = None) -> tuple[list[list[Scalar]], list[Scalar]]:
+def factorize(
+    lower: Matrix, safeguard: Callable[[Scalar], Scalar] | None = None
+) -> tuple[list[list[Scalar]], list[Scalar]]:
     """Factorize a symmetric matrix as ``L D L^T``.
 
     Args:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,8 +58,8 @@ class Robot:
     def skeleton(self) -> tuple[tuple[int, int], ...]:
         """Segments that stand for the moving links: index pairs into (joint origins..., tip).
 
-        Origins of successive joints are joined; points that coincide are merged, collinear neighbours (links of one straight
-        piece) become one segment, and what joint 1 cannot move is left out.
+        Origins of successive joints are joined; points that coincide are merged, collinear neighbours (links of one
+        straight piece) become one segment, and what joint 1 cannot move is left out.
         """
         return _skeleton(self.model, self.tip)
 
@@ -79,7 +80,9 @@ def load_robot(problem: Problem) -> Robot:
     model = _reduced_model(urdf, spec.joints)
     if not model.existFrame(spec.tip):
         known = [frame.name for frame in model.frames]
-        raise RecipeError([f"{problem.path}: robot.tip: {urdf.name} has no frame {spec.tip!r}{nearest(spec.tip, known)}"])
+        raise RecipeError(
+            [f"{problem.path}: robot.tip: {urdf.name} has no frame {spec.tip!r}{nearest(spec.tip, known)}"]
+        )
     velocity = limits.velocity_scale * np.array(model.velocityLimit)
     middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
@@ -119,7 +122,7 @@ def _reduced_model(urdf: Path, joints: tuple[str, ...]) -> "pin.Model":
 
 
 def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
-    """Merge the chain of joint origins into straight segments; what is straight at random configurations is always so."""
+    """Merge the chain of joint origins into segments; what is straight at random configurations always is."""
     import pinocchio as pin
 
     data, random = model.createData(), np.random.default_rng(0)
@@ -146,20 +149,21 @@ def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
             kept[-1] = point
         else:
             kept.append(point)
-    pairs = zip(kept, kept[1:], strict=False)
-    return tuple((a, b) for a, b in pairs if not (still(a) and still(b)))
+    return tuple((a, b) for a, b in pairwise(kept) if not (still(a) and still(b)))
 
 
 def _check(problem: Problem, robot: Robot) -> None:
     """Raise RecipeError for limits that no motion can meet."""
     mistakes = []
     if robot.base.shape != (robot.n,):
-        mistakes.append(f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {robot.base.size}")
+        mistakes.append(
+            f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {robot.base.size}"
+        )
     elif np.any(robot.base < robot.position_lower) or np.any(robot.base > robot.position_upper):
         worst = int(np.argmax(np.maximum(robot.position_lower - robot.base, robot.base - robot.position_upper)))
         mistakes.append(
-            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {robot.base[worst]:g} rad is outside its planning limits"
-            f" [{robot.position_lower[worst]:g}, {robot.position_upper[worst]:g}]"
+            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {robot.base[worst]:g} rad is outside its"
+            f" planning limits [{robot.position_lower[worst]:g}, {robot.position_upper[worst]:g}]"
         )
     for what, limit in (("velocity", robot.velocity_limit), ("torque", robot.torque_limit)):
         mistakes.extend(

@@ -1,6 +1,7 @@
 """Kinematics and dynamics of a chain as CasADi SX: positions, Jacobian, bias acceleration, recursive Newton-Euler.
 
-All vectors are Python lists of SX scalars in the world frame unless said otherwise; structural zeros of the URDF cost nothing.
+All vectors are Python lists of SX scalars in the world frame unless said otherwise; structural zeros of the URDF cost
+nothing.
 """
 
 from dataclasses import dataclass
@@ -133,7 +134,9 @@ def _body_wrench(joint: Joint, omega: Vec, alpha: Vec, acceleration: Vec) -> tup
     return force, add(spin, cross(com, force))
 
 
-def _propagate(chain: Chain, rotations: list[list[Vec]], offsets: list[Vec], forces: list[Vec], moments: list[Vec]) -> Vec:
+def _propagate(
+    chain: Chain, rotations: list[list[Vec]], offsets: list[Vec], forces: list[Vec], moments: list[Vec]
+) -> Vec:
     """Sum wrenches from the tip to the base and project them on the joint axes."""
     force: Vec = [0.0, 0.0, 0.0]
     moment: Vec = [0.0, 0.0, 0.0]
@@ -191,7 +194,7 @@ class SymbolicState:
 
     @property
     def segments(self) -> list[tuple[Vec, Vec]]:
-        """The moving segments of the robot's skeleton: between the distinct, not collinear joint origins and the tip [m]."""
+        """The moving segments of the robot's skeleton: pairs of points [m]."""
         points = [*self.kinematics.origins, self.kinematics.tip]
         return [(points[a], points[b]) for a, b in self.robot.skeleton]
 

@@ -22,6 +22,7 @@ from cnpgen.store.files import committing, machine_error
 FORMAT = "cnpgen-shard"
 FORMAT_VERSION = 1
 _STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
+_DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # what h5py raises on broken files
 _SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
 
 
@@ -139,7 +140,7 @@ def _create(buffer: io.BytesIO) -> Any:
     creation.set_obj_track_times(False)
     access.set_fileobj_driver(h5fd.fileobj_driver, buffer)
     access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
-    access.set_alignment(512, 64)
+    access.set_alignment(1, 64)
     return h5f.create(b"shard", h5f.ACC_TRUNC, creation, access)
 
 
@@ -153,7 +154,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             yield file
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
+    except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error

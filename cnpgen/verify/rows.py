@@ -1,4 +1,4 @@
-"""Recompute what the rows of a dataset claim: every constraint at both ends, positions and hits, from the stored numbers."""
+"""Recompute what rows claim from their stored numbers: every constraint at both ends, positions and hits."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,19 +30,24 @@ def verify_rows(
 ) -> RowReport:
     """Verify rows with Pinocchio and Coal.
 
-    Checked are, at both ends of every row: all values are finite ("not finite"); the tip is where ``*_xyz`` says ("tip
-    position"); what every constraint of the problem asks of a boundary state, under its conditions' names; and, if the rows have
-    ``hit_angle`` and ``hit_speed``, that the tip moves that way ("hit direction", where the speed is positive) that fast ("hit
-    speed") at the goal. How exactly is ``cnpgen.constraints.constraint.EXACTNESS``. A row that is not finite fails under that
-    name only. Conditions on accelerations are skipped at an end whose accelerations are not stored, unless the row is at rest
-    there: a robot that stands still has ddq = 0, hence its static torque is checked.
+    Checked are, for every row and both of its ends:
+
+    * "finite": every value is; a row that is not fails under this name only;
+    * "tip position": the tip is at ``start_xyz`` and ``goal_xyz``;
+    * what every constraint of the problem asks of a boundary state, under its conditions' names. What depends on
+      accelerations is skipped at an end whose accelerations are not stored, unless the row rests there: a robot that
+      stands still has ddq = 0, so its static torque is checked;
+    * "hit direction", where ``hit_speed`` is positive, and "hit speed", along the hit: of the tip at the goal, if the
+      rows have ``hit_angle`` and ``hit_speed``.
+
+    How exactly each must hold is ``cnpgen.constraints.constraint.EXACTNESS``.
 
     Args:
         problem: The problem.
         robot: Its robot.
         columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
-            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle`` and ``hit_speed``.
-            Of other fields only whether they are finite is checked.
+            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``.
+            Other fields must be finite.
         dtype: The float type that the rows are stored in, which decides how exact they must be.
 
     Raises:
@@ -51,14 +56,9 @@ def verify_rows(
     values = _read(columns, robot.n)
     rows = len(values["start_q"])
     world = World(problem, robot)
-    return merge(
-        [
-            _verify_block(
-                problem, world, {name: column[first : first + BLOCK] for name, column in values.items()}, dtype
-            )
-            for first in range(0, max(rows, 1), BLOCK)
-        ]
-    )
+    slices = [slice(first, first + BLOCK) for first in range(0, max(rows, 1), BLOCK)]
+    blocks = ({name: column[part] for name, column in values.items()} for part in slices)
+    return merge([_verify_block(problem, world, block, dtype) for block in blocks])
 
 
 def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
@@ -77,27 +77,22 @@ def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
 
 @dataclass
 class _Values:
-    """The values of one condition over many states, and their bounds; lists grow faster than arrays."""
+    """One condition in many states, and the row and end of each."""
 
-    g: list[float] = field(default_factory=list)
-    lower: list[float] = field(default_factory=list)
-    upper: list[float] = field(default_factory=list)
-    where: list[tuple[int, int, int]] = field(default_factory=list)  # row, end, number of values
-
-    def add(self, condition: Condition, row: int, end: int) -> None:
-        self.g.extend(condition.g)
-        self.lower.extend(condition.lower.tolist())
-        self.upper.extend(condition.upper.tolist())
-        self.where.append((row, end, len(condition.g)))
+    found: list[Condition] = field(default_factory=list)
+    where: list[tuple[int, int]] = field(default_factory=list)
 
     def judged(self, key: Key, dtype: str) -> tuple[Check, Index]:
+        """Judge all states at once."""
         name, unit, exactness = key
-        g, lower, upper = (np.array(values, float) for values in (self.g, self.lower, self.upper))
-        row, end, count = np.array(self.where, np.int64).T
-        allowed = Condition(name, unit, self.g, lower, upper, exactness).slack(dtype)
+        values = list(chain.from_iterable(condition.g for condition in self.found))
+        lower, upper = (np.concatenate([getattr(c, side) for c in self.found]) for side in ("lower", "upper"))
+        count = [len(condition.g) for condition in self.found]
+        row, end = np.repeat(np.array(self.where, np.int64), count, axis=0).T
+        g = np.array(values, float)
         violation = np.maximum(np.maximum(lower - g, g - upper), 0.0)
-        where = {"row": np.repeat(row, count), "end": np.repeat(end, count)}
-        return judge(name, unit, violation=violation, allowed=allowed, **where)
+        allowed = Condition(name, unit, values, lower, upper, exactness).slack(dtype)
+        return judge(name, unit, violation=violation, allowed=allowed, row=row, end=end)
 
 
 @dataclass
@@ -120,15 +115,10 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
     n_bad = np.sum([np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0)
     finite = np.flatnonzero(n_bad == 0)
     block = _measure(problem, world, columns, finite)
-    everywhere = np.arange(rows), np.zeros(rows, np.int64)
+    zeros = np.zeros(rows, np.int64)
     judged = [
         judge(
-            "not finite",
-            "1",
-            violation=n_bad.astype(float),
-            allowed=np.zeros(rows),
-            row=everywhere[0],
-            end=everywhere[1],
+            "finite", "1", violation=n_bad.astype(float), allowed=zeros.astype(float), row=np.arange(rows), end=zeros
         ),
         _judge_position(block, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in block.conditions.items()),
@@ -160,7 +150,9 @@ def _note(block: _Block, found: Iterator[Condition], order: int, where: tuple[in
     for condition in found:
         if condition.needs <= order:
             key = condition.name, condition.unit, condition.exactness
-            block.conditions.setdefault(key, _Values()).add(condition, *where)
+            values = block.conditions.get(key) or block.conditions.setdefault(key, _Values())
+            values.found.append(condition)
+            values.where.append(where)
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:

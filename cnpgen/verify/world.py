@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 class World:
     """The robot of a problem at one state, among the obstacles.
 
-    ``set_state`` runs the forward kinematics; everything else is computed when it is read. All vectors are in the world frame.
-    A world belongs to one process and one thread: Pinocchio's and Coal's memory is reused from state to state.
+    ``set_state`` runs the forward kinematics; everything else is computed when it is read. Vectors are in the world
+    frame. A world belongs to one process and one thread: Pinocchio's and Coal's memory is reused from state to state.
 
     Args:
         problem: The problem.
@@ -41,6 +41,7 @@ class World:
         self._object_size = None if problem.object is None else problem.object.size
         self._scene = Scene(problem.obstacle, self._object_size, len(robot.skeleton))
         self._skeleton = robot.skeleton
+        self._joints = sorted({point for segment in robot.skeleton for point in segment} - {robot.n})
         zero = np.zeros(robot.n)
         self.set_state(robot.base, zero, zero, np.zeros(len(problem.obstacle)))
 
@@ -95,8 +96,9 @@ class World:
 
     def segment_distances(self) -> list[float]:
         """Measure how far every segment of the robot's skeleton is from every obstacle, segment by segment [m]."""
-        points = [pose.translation.tolist() for pose in self._data.oMi[1:]]
-        points.append(self._T_world_tip.translation.tolist())
+        poses = self._data.oMi  # of the universe and joints 1 to n
+        points = {joint: poses[joint + 1].translation.tolist() for joint in self._joints}
+        points[self.robot.n] = self._T_world_tip.translation.tolist()
         return self._scene.segment_distances([(points[a], points[b]) for a, b in self._skeleton])
 
     def object_distances(self) -> list[float]:
@@ -106,16 +108,14 @@ class World:
             RecipeError: The problem has no object.
         """
         if self._object_size is None:
-            raise RecipeError(
-                ["a constraint asks for the distance of the held object, but the problem has no [object]"]
-            )
+            raise RecipeError(["a constraint is about the held object, but the problem has no [object]"])
         return self._scene.object_distances(self._T_world_tip.translation, self._T_world_tip.rotation)
 
 
 def obstacle_tops(problem: "Problem", start_xyz: Array, goal_xyz: Array) -> Array:
     """Compute the heights of the obstacles' upper faces [m], shape (..., n_obstacles).
 
-    An obstacle with ``below`` ends at the bottom of the object (at the tip, if there is none) at that end of the motion.
+    An obstacle with ``below`` ends at the bottom of the object (at the tip, if there is none) at that end.
 
     Args:
         problem: The problem.

@@ -1,0 +1,214 @@
+"""Proving a dataset: its files, every row by Pinocchio and Coal, and random blocks made again."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.errors import CnpgenError, DatasetError, UsageError
+from cnpgen.kernels.library import choose_backend
+from cnpgen.library import restore_dataset_recipe
+from cnpgen.make import shard_columns, versions, worker_count
+from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
+from cnpgen.recipes import DatasetRecipe
+from cnpgen.robots.robot import load_robot
+from cnpgen.store.check import Finding, check_dataset
+from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.reader import open_dataset
+from cnpgen.store.record import is_committed
+from cnpgen.store.shard import read_shard
+from cnpgen.verify.report import RowReport, merge
+from cnpgen.verify.rows import verify_rows
+
+PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
+
+
+@dataclass(frozen=True)
+class ValidationReport:
+    """What validation found.
+
+    Attributes:
+        folder: The dataset.
+        rows: Rows of the shards that are there.
+        findings: What is wrong, file by file.
+        deep: What Pinocchio and Coal say of every row, or None if they were not asked.
+        regenerated: How many blocks were made again.
+        identical: How many of them came out with the same bits.
+    """
+
+    folder: Path
+    rows: int
+    findings: tuple[Finding, ...]
+    deep: RowReport | None = None
+    regenerated: int = 0
+    identical: int = 0
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.findings
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report for JSON."""
+        return {
+            "folder": str(self.folder),
+            "ok": self.ok,
+            "rows": self.rows,
+            "findings": [{"file": finding.file, "problem": finding.problem} for finding in self.findings],
+            "deep": self.deep.to_dict() if self.deep else None,
+            "regenerated": self.regenerated,
+            "identical": self.identical,
+        }
+
+    def summary(self) -> str:
+        """Say in a few lines what was checked and what came out."""
+        lines = [f"{self.folder}: {self.rows} rows, {len(self.findings) or 'no'} findings"]
+        if self.deep:
+            lines.append(f"  recomputed with Pinocchio and Coal: {self.deep.rows} rows, {len(self.deep.out)} out")
+            lines += [
+                f"    {check.name:<22} worst {check.worst:9.2e} of {check.allowed:9.2e} {check.unit:<8}"
+                f" {check.rows_out} rows out"
+                for check in self.deep.checks
+            ]
+        if self.regenerated:
+            lines.append(f"  made again: {self.regenerated} blocks, {self.identical} identical to the bit")
+        return "\n".join(lines)
+
+
+def validate_dataset(
+    folder: str | Path,
+    *,
+    deep: bool = False,
+    regenerate: int = 0,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> ValidationReport:
+    """Check a dataset.
+
+    Checksums, counts, schema and provenance always; optionally every row and a few blocks from the seed.
+
+    Args:
+        folder: The dataset.
+        deep: Whether to recompute every row's kinematics, limits, torques, manifold and collisions with Pinocchio and
+            Coal.
+        regenerate: How many random blocks to make again and compare.
+        workers: Processes for the deep check; default one per available core.
+        progress: Called with the rows of every shard that was recomputed.
+
+    Raises:
+        UsageError: There is no dataset, or an argument makes no sense.
+        RecipeError: The recipe in the plan does not fit this version of cnpgen.
+        MachineError: The disk or the backend fails.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder")
+    if regenerate < 0:
+        raise UsageError(f"regenerate must not be negative, got {regenerate}")
+    findings = list(check_dataset(folder))
+    try:
+        plan = load_plan(folder)
+    except DatasetError:
+        return ValidationReport(folder, 0, tuple(findings))
+    present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
+    report, identical = None, 0
+    if deep:
+        report, found = _deep(folder, plan, present, worker_count(workers, len(present)), progress)
+        findings += found
+    if regenerate:
+        identical, found = _regenerate(folder, plan, present, regenerate)
+        findings += found
+    rows = sum(task.rows for task in present)
+    return ValidationReport(folder, rows, tuple(findings), report, regenerate if present else 0, identical)
+
+
+def _deep(
+    folder: Path, plan: DatasetPlan, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
+) -> tuple[RowReport | None, list[Finding]]:
+    """Recompute every row, shard by shard."""
+    from joblib import Parallel, delayed
+
+    reports, findings = [], []
+    run = Parallel(n_jobs=workers, return_as="generator", batch_size=1)
+    for task, result in zip(tasks, run(delayed(_verify_shard)(folder, plan, task) for task in tasks), strict=True):
+        if isinstance(result, str):
+            findings.append(Finding(task.file, result))
+            continue
+        reports.append(result)
+        findings += [
+            Finding(
+                task.file,
+                f"{check.name}: {check.rows_out} rows out, worst {check.worst:.3g} {check.unit}"
+                f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}",
+            )
+            for check in result.failed
+        ]
+        if progress is not None:
+            progress(task.rows)
+    return merge(reports) if reports else None, findings
+
+
+def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> RowReport | str:
+    """Verify one shard; a shard that cannot be read is a finding, not an exception."""
+    try:
+        columns = read_shard(folder / task.file)
+    except CnpgenError as error:
+        return str(error)
+    with restored(plan) as recipe:
+        problem = recipe.pipeline.problem
+        return verify_rows(problem, load_robot(problem), columns, dtype=plan.dtype)
+
+
+def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> tuple[int, list[Finding]]:
+    """Make random blocks again and compare them with what is stored."""
+    backend, cache_folder = choose_backend(plan.backend)
+    dataset = open_dataset(folder, allow_partial=True)
+    random = np.random.default_rng()
+    identical, findings = 0, []
+    with restored(plan) as recipe:
+        prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=plan.dtype)
+        for _ in range(count if tasks else 0):
+            task = tasks[random.integers(len(tasks))]
+            block = task.first_row // BLOCK_ROWS + int(random.integers(-(-task.rows // BLOCK_ROWS)))
+            start, stop = (
+                max(block * BLOCK_ROWS, task.first_row),
+                min((block + 1) * BLOCK_ROWS, task.first_row + task.rows),
+            )
+            again, _ = shard_columns(prepared, plan, ShardTask(task.split, task.index, start, stop - start))
+            stored = dataset.read(task.split, start=start, stop=stop)
+            same, problem = _compare(stored, again)
+            identical += same
+            if problem:
+                findings.append(
+                    Finding(task.file, f"block {block} made again from the seed: {problem}{_explanation(plan)}")
+                )
+    return identical, findings
+
+
+def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
+    """Return whether all bits are the same, and what differs by more than arithmetic on another machine can explain."""
+    same = all(np.array_equal(stored[name], values) for name, values in again.items())
+    for name, values in again.items():
+        allowed = PORTABLE if values.dtype != np.float32 else 1e-5
+        off = np.abs(stored[name].astype(float) - values.astype(float))
+        if off.size and float(off.max()) > allowed:
+            return same, f"{name} differs by {off.max():.3g}"
+    return same, ""
+
+
+def _explanation(plan: DatasetPlan) -> str:
+    """Name the libraries that are not those that made the dataset."""
+    now = versions()
+    other = [f"{name} {was} -> {now.get(name)}" for name, was in plan.versions.items() if now.get(name) != was]
+    return f" (made with other versions: {', '.join(other)})" if other else ""
+
+
+@contextmanager
+def restored(plan: DatasetPlan) -> Iterator[DatasetRecipe]:
+    """Rebuild the recipe from a plan, its URDF in a temporary folder."""
+    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+        yield restore_dataset_recipe(dict(plan.recipe), str(plan.robot["urdf"]), Path(folder))

@@ -1,0 +1,175 @@
+"""Problem, Pipeline and DatasetRecipe: splits, resolved values, identity."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.library import list_recipes, load_dataset_recipe
+from cnpgen.pipelines.stage import Stage
+from cnpgen.recipes import (
+    DatasetRecipe,
+    LimitSpec,
+    Obstacle,
+    Pipeline,
+    Problem,
+    RobotSpec,
+    TrajectorySpec,
+    recipe_digest,
+    resolved,
+    split_rows,
+)
+from cnpgen.schema import Range, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roll(Stage):
+    size: Range = field("size of the die", unit="m")
+
+    def describe(self):
+        return "roll"
+
+    def provides(self, context):
+        return ()
+
+    def prepare(self, context):
+        return lambda batch, random: None
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    (tmp_path / "arm.urdf").write_text("<robot name='arm'/>")
+    robot = RobotSpec(urdf="arm.urdf", joints=("a", "b"), tip="hand", base=(0.0, 0.0))
+    problem = Problem(name="arm", robot=robot, limits=LimitSpec(), path=tmp_path / "problem.toml")
+    pipeline = Pipeline(name="arm", problem=problem, stage=(Roll(size=Range(0.0, 1.0)),), path=tmp_path / "arm.toml")
+    return DatasetRecipe(name="arm", pipeline=pipeline, splits={"train": 80, "validation": 10, "test": 10})
+
+
+def with_splits(recipe: DatasetRecipe, rows: Iterable[int]) -> DatasetRecipe:
+    return replace(recipe, splits=dict(zip("abcdefgh", rows, strict=False)))
+
+
+SPLITS = [(1,), (90, 10), (80, 10, 10), (1, 1, 1), (1, 45, 45), (7, 3, 3, 1), (1, 1000, 2), (19000, 1000)]
+
+
+@pytest.mark.parametrize("rows", SPLITS)
+def test_no_split_shrinks_when_n_grows(recipe, rows):
+    recipe = with_splits(recipe, rows)
+    before: dict[str, int] = {}
+    for n in range(1, 2 * min(sum(rows), 500) + 3):
+        now = split_rows(recipe, n)
+        assert sum(now.values()) == n
+        assert all(now.get(name, 0) >= count for name, count in before.items())
+        before = now
+
+
+@pytest.mark.parametrize("rows", SPLITS)
+def test_n_equal_to_the_total_gives_the_recipes_own_rows(recipe, rows):
+    recipe = with_splits(recipe, rows)
+    for factor in (1, 2, 10**12):
+        expected = {name: count * factor for name, count in recipe.splits.items()}
+        assert split_rows(recipe, factor * sum(rows)) == expected
+
+
+@pytest.mark.parametrize("rows", SPLITS)
+def test_every_split_is_within_its_share(recipe, rows):
+    recipe = with_splits(recipe, rows)
+    total = sum(rows)
+    for n in (1, 5, 17, 999):
+        now = split_rows(recipe, n)
+        assert all(now.get(name, 0) >= n * share // total for name, share in recipe.splits.items())
+
+
+def test_a_split_without_rows_is_left_out_and_the_order_is_kept(recipe):
+    assert split_rows(recipe, 1) == {"train": 1}
+    assert split_rows(recipe, 9) == {"train": 8, "validation": 1}
+    assert list(split_rows(recipe, 10)) == ["train", "validation", "test"]
+
+
+@pytest.mark.parametrize("n", [0, -1])
+def test_no_rows_is_a_usage_error(recipe, n):
+    with pytest.raises(UsageError, match="at least 1"):
+        split_rows(recipe, n)
+
+
+def test_resolved_is_plain_json_with_everything_referred_to(recipe):
+    plain = resolved(recipe)
+    assert json.loads(json.dumps(plain)) == plain
+    assert plain["pipeline"]["stage"] == [{"use": f"{__name__}:Roll", "size": [0.0, 1.0]}]
+    assert plain["pipeline"]["problem"]["limits"]["acceleration_cap"] == 20.0
+    assert plain["version"] == "1.0.0"
+    assert "path" not in plain
+    assert "digest" not in plain["pipeline"]
+
+
+def changed(recipe: DatasetRecipe, **pipeline) -> DatasetRecipe:
+    return replace(recipe, pipeline=replace(recipe.pipeline, **pipeline))
+
+
+def test_the_digest_ignores_what_does_not_change_the_rows_of_a_seed(recipe, tmp_path):
+    digest = recipe_digest(recipe)
+    assert len(digest) == 64
+    assert recipe_digest(recipe.pipeline) == digest
+    assert recipe_digest(replace(recipe, title="x", seed=7, splits={"a": 1}, version="2.0.0", name="x")) == digest
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    (moved / "renamed.urdf").write_bytes((tmp_path / "arm.urdf").read_bytes())
+    problem = recipe.pipeline.problem
+    robot = replace(problem.robot, urdf="renamed.urdf")
+    problem = replace(problem, title="x", path=moved / "other.toml", digest="x", robot=robot)
+    assert recipe_digest(changed(recipe, title="x", path=moved, digest="x", problem=problem)) == digest
+
+
+def test_the_digest_changes_with_stages_problem_and_urdf(recipe, tmp_path):
+    digest = recipe_digest(recipe)
+    problem = recipe.pipeline.problem
+    others = {
+        recipe_digest(changed(recipe, stage=(Roll(size=Range(0.0, 2.0)),))),
+        recipe_digest(changed(recipe, stage=recipe.pipeline.stage * 2)),
+        recipe_digest(changed(recipe, problem=replace(problem, limits=LimitSpec(velocity_scale=0.5)))),
+    }
+    (tmp_path / "arm.urdf").write_text("<robot name='leg'/>")
+    others.add(recipe_digest(recipe))
+    assert len(others | {digest}) == 5
+
+
+def test_base_has_one_value_per_planned_joint():
+    robot = RobotSpec(urdf="arm.urdf", joints=("a", "b"), tip="hand", base=(0.0, 0.0))
+    assert list(robot.find_mistakes()) == []
+    assert list(replace(robot, base=(0.0,)).find_mistakes()) == [
+        ("base", "expected 2 numbers, one per planned joint, got 1")
+    ]
+
+
+def test_a_joint_is_planned_once():
+    robot = RobotSpec(urdf="arm.urdf", joints=("a", "a"), tip="hand", base=(0.0, 0.0))
+    assert [key for key, _ in robot.find_mistakes()] == ["joints"]
+
+
+@pytest.mark.parametrize(
+    ("top", "below", "keys"), [(0.5, "", []), (None, "start", []), (None, "", ["top"]), (0.5, "goal", ["top"])]
+)
+def test_an_obstacle_has_either_a_top_or_an_object_on_it(top, below, keys):
+    obstacle = Obstacle(name="box", x=Range(0.0, 1.0), y=Range(0.0, 1.0), top=top, below=below)
+    assert [key for key, _ in obstacle.find_mistakes()] == keys
+
+
+def test_an_obstacle_has_an_extent():
+    obstacle = Obstacle(name="box", x=Range(0.0, 0.0), y=Range(1.0, 1.0), top=0.0)
+    assert [key for key, _ in obstacle.find_mistakes()] == ["x", "y"]
+
+
+@pytest.mark.parametrize(("count", "keys"), [(8, []), (7, ["path_control_points"])])
+def test_a_spline_has_more_control_points_than_its_degree(count, keys):
+    spec = TrajectorySpec(degree=7, path_control_points=count)
+    assert [key for key, _ in spec.find_mistakes()] == keys
+
+
+@pytest.mark.parametrize("name", list_recipes("dataset"))
+def test_every_shipped_dataset_loads_and_resolves(name):
+    recipe = load_dataset_recipe(name)
+    assert recipe.name == name
+    assert all(":" not in stage["use"] for stage in resolved(recipe)["pipeline"]["stage"])
+    assert split_rows(recipe, sum(recipe.splits.values())) == recipe.splits
