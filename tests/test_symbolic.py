@@ -1,5 +1,6 @@
 """The symbolic chain and the symbolic distances against Pinocchio and Coal."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import casadi as ca
@@ -8,10 +9,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.kernels.interpreted import InterpretedKernel
+from cnpgen.kernels.tape import tape_from_function
 from cnpgen.library import load_problem
 from cnpgen.recipes import LimitSpec, Problem, RobotSpec
 from cnpgen.robots.boxes import segment_box_distance, upright_box_separation
-from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.robots.symbolic import (
     bias_acceleration,
@@ -164,32 +166,150 @@ def test_chain_rounds_a_urdf_pi_half_to_exact_zeros():
     assert set(np.unique(np.abs(chain.joints[1].rotation))) <= {0.0, 1.0}
 
 
-def test_reach_is_never_exceeded(robot):
-    if any(joint.prismatic for joint in robot.chain.joints):
-        pytest.skip("the bound is for revolute chains")
-    model, data, tip = robot.model, robot.model.createData(), robot.model.getFrameId(robot.tip)
-    for q, _, _ in random_states(robot):
-        pin.framesForwardKinematics(model, data, q)
-        distance = np.linalg.norm(data.oMf[tip].translation - data.oMi[1].translation)
-        assert distance <= robot.chain.reach + 1e-12
+def test_reach_of_a_revolute_chain_is_never_exceeded(tmp_path):
+    for robot in (load_robot(load_problem("heavy-object")), synthetic(tmp_path, ARBITRARY)):
+        model, data = robot.model, robot.model.createData()
+        for q, _, _ in random_states(robot):
+            pin.framesForwardKinematics(model, data, q)
+            tip = data.oMf[model.getFrameId(robot.tip)].translation
+            assert np.linalg.norm(tip - data.oMi[1].translation) <= robot.chain.reach + 1e-12
 
 
-def test_bodies_behind_the_tip_and_locked_joints_count_as_mass(tmp_path):
-    robot = load_robot(load_problem("airhockey"))
+def test_every_moving_body_counts_once(robot):
     full = pin.buildModelFromUrdf(str(robot.urdf))
-    moving = [full.getJointId(name) for name in robot.joint_names]
-    expected = sum(inertia.mass for inertia in list(full.inertias)[moving[0] :])
+    first = full.getJointId(robot.joint_names[0])
+    expected = sum(inertia.mass for inertia in list(full.inertias)[first:])
     assert sum(joint.mass for joint in robot.chain.joints) == pytest.approx(expected, abs=1e-12)
-    assert chain_from_model(robot.model, robot.tip) == pytest.approx(robot.chain) or True
 
 
-# --- distances -------------------------------------------------------------------------------------------------------
+# --- distances: one obstacle, random and degenerate segments and cuboids against Coal ---------------------------------
 
 LOW, HIGH = np.array([0.2, -0.6, -1.1]), np.array([0.6, -0.3, 0.5])
+SIZE = (0.2, 0.2, 0.3)
+FACES = np.array([LOW - 0.1, LOW, (LOW + HIGH) / 2, HIGH, HIGH + 0.1])
 
 
-def coal_distance(shape: object, rotation: np.ndarray, position: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    request.gjk_tolerance = 1e-12
-    places = coal.Transform3s(rotation, position), coal.Transform3s(np.eye(3), (low + high) / 2)
-    return coal.distance(shape, places[0], coal.Box(*(high - low)), places[1], request, result)
+def coal_distance(shape: object, rotation: np.ndarray, position: np.ndarray) -> float:
+    request = coal.DistanceRequest()
+    request.gjk_tolerance, request.epa_tolerance = 1e-12, 1e-9
+    places = coal.Transform3s(rotation, position), coal.Transform3s(np.eye(3), (LOW + HIGH) / 2)
+    return coal.distance(shape, places[0], coal.Box(*(HIGH - LOW)), places[1], request, coal.DistanceResult())
+
+
+def coal_segment_distance(first: np.ndarray, second: np.ndarray) -> float:
+    length = float(np.linalg.norm(second - first))
+    along = (second - first) / length if length else np.array([0.0, 0.0, 1.0])
+    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).toRotationMatrix()
+    return max(coal_distance(coal.Capsule(0.0, length), rotation, (first + second) / 2), 0.0)
+
+
+def segments(kind: str, count: int = 400) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    random = np.random.default_rng(2)
+    for _ in range(count):
+        first, second = random.uniform(LOW - 0.4, HIGH + 0.4, (2, 3))
+        axis = random.integers(3)
+        if kind == "parallel to two faces":
+            second[axis] = first[axis]
+        if kind == "parallel to an edge":
+            second = np.where(np.arange(3) == axis, second, first)
+        if kind == "in the plane of a face":
+            first[axis] = second[axis] = random.choice([LOW[axis], HIGH[axis]])
+        if kind == "between corners, edges and faces":
+            first, second = (np.array([random.choice(FACES[:, k]) for k in range(3)]) for _ in range(2))
+        if kind == "inside":
+            first, second = random.uniform(LOW, HIGH, (2, 3))
+        if kind == "touching the top":
+            first, second = np.append(random.uniform(LOW, HIGH)[:2], HIGH[2]), second + np.array([0, 0, 2])
+        if kind == "of no length":
+            second = first.copy()
+        yield first, second
+
+
+def box_bounds() -> list[tuple[float, float]]:
+    return list(zip(LOW.tolist(), HIGH.tolist(), strict=True))
+
+
+@pytest.fixture(scope="module")
+def segment_function() -> ca.Function:
+    (first_sx, first), (second_sx, second) = symbols("first", 3), symbols("second", 3)
+    return ca.Function("segment", [first_sx, second_sx], [segment_box_distance(first, second, box_bounds())])
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "random",
+        "parallel to two faces",
+        "parallel to an edge",
+        "in the plane of a face",
+        "between corners, edges and faces",
+        "inside",
+        "touching the top",
+        "of no length",
+    ],
+)
+def test_segment_box_distance_agrees_with_coal(segment_function, kind):
+    cases = list(segments(kind))
+    found = np.array([float(segment_function(first, second)) for first, second in cases])
+    expected = np.array([coal_segment_distance(first, second) for first, second in cases])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    if kind in {"inside", "touching the top"}:
+        np.testing.assert_array_equal(found, 0.0)
+
+
+def test_segment_box_distance_is_no_nan_where_numpy_maximum_would_pass_one_on(segment_function):
+    first, second = (
+        np.array(points).T.copy() for points in zip(*segments("between corners, edges and faces"), strict=True)
+    )
+    expected = [float(segment_function(a, b)) for a, b in zip(first.T, second.T, strict=True)]
+    (found,) = InterpretedKernel(tape_from_function(segment_function))(first, second)
+    np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-15)
+
+
+@pytest.fixture(scope="module")
+def cuboid_function() -> ca.Function:
+    (centre_sx, centre), (rotation_sx, rotation) = symbols("centre", 3), symbols("rotation", 9)
+    rows = [rotation[0:3], rotation[3:6], rotation[6:9]]
+    endless = [*box_bounds()[:2], (None, HIGH[2])]
+    outputs = [upright_box_separation(centre, rows, SIZE, box) for box in (box_bounds(), endless)]
+    return ca.Function("cuboid", [centre_sx, rotation_sx], outputs)
+
+
+def cuboids(tilt: float, count: int = 1500) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    random = np.random.default_rng(3)
+    for index in range(count):
+        position = random.uniform(LOW - 0.2, HIGH + 0.2)
+        position[2] = HIGH[2] + 0.15 + random.choice([0.0, 1e-9, -1e-9, 1e-4, -1e-4, *random.uniform(-0.4, 0.1, 3)])
+        turn = [0.0, np.pi / 2, *random.uniform(-np.pi, np.pi, 4)][index % 6]
+        lean = random.uniform(-np.pi, np.pi)
+        rotation = pin.exp3(tilt * np.array([np.cos(lean), np.sin(lean), 0.0])) @ pin.exp3(np.array([0.0, 0.0, turn]))
+        yield position, rotation
+
+
+def test_separation_of_an_upright_cuboid_agrees_with_coal(cuboid_function):
+    overlapping = 0
+    for position, rotation in cuboids(tilt=0.0):
+        found, _ = (float(value) for value in cuboid_function(position, rotation.ravel()))
+        expected = coal_distance(coal.Box(*SIZE), rotation, position)
+        overlapping += expected < 0
+        if expected <= 0:
+            assert found == pytest.approx(expected, abs=1e-9)
+        else:
+            assert -1e-9 < found < expected + 1e-9
+    assert 300 < overlapping < 1400
+
+
+@pytest.mark.parametrize("tilt", [1e-8, 1e-3, np.deg2rad(1.0)])
+def test_separation_of_a_tilted_cuboid_is_a_lower_bound(cuboid_function, tilt):
+    for position, rotation in cuboids(tilt):
+        found, _ = (float(value) for value in cuboid_function(position, rotation.ravel()))
+        expected = coal_distance(coal.Box(*SIZE), rotation, position)
+        assert found <= expected + 1e-9 + tilt**2 * max(-expected, 0.0)
+
+
+def test_a_box_without_lower_end_separates_from_above_and_from_the_sides_only(cuboid_function):
+    upright = np.eye(3).ravel()
+    below = np.array([0.4, -0.45, LOW[2] - 0.5])
+    box, endless = (float(value) for value in cuboid_function(below, upright))
+    assert box == pytest.approx(0.35)
+    assert endless == pytest.approx(-0.25)  # the way out is sideways, along y

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, nearest
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -64,20 +64,23 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     """Read the chain that ends in frame ``tip`` from a reduced Pinocchio model.
 
     Raises:
-        RecipeError: The model is not one serial chain of one-degree-of-freedom joints that carries the tip.
+        RecipeError: The model is not one serial chain of revolute and prismatic joints that carries the tip.
     """
     data = model.createData()
     for index in range(1, model.njoints):
-        kind = model.joints[index].shortname()
+        name, kind = model.names[index], model.joints[index].shortname()
         if model.joints[index].nq != 1 or model.joints[index].nv != 1:
-            raise RecipeError(
-                [f"{model.names[index]}: joints of type {kind} are not supported, only revolute and prismatic ones"]
-            )
+            needed = "only revolute and prismatic ones are supported (a continuous one needs limits)"
+            raise RecipeError([f"robot.joints: {name!r} is a joint of type {kind}, {needed}"])
         if model.parents[index] != index - 1:
-            raise RecipeError([f"{model.names[index]}: the planned joints do not form one serial chain"])
+            before = model.names[index - 1]
+            raise RecipeError([f"robot.joints: {name!r} is not moved by {before!r}, expected one serial chain"])
+    if not model.existFrame(tip):
+        known = [frame.name for frame in model.frames]
+        raise RecipeError([f"robot.tip: {model.name} has no frame {tip!r}{nearest(tip, known)}"])
     frame = model.frames[model.getFrameId(tip)]
     if frame.parentJoint != model.njoints - 1:
-        raise RecipeError([f"tip frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
+        raise RecipeError([f"robot.tip: frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
     joints = tuple(_joint(model, data, index) for index in range(1, model.njoints))
     return Chain(
         joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear)

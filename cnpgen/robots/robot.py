@@ -76,18 +76,16 @@ def load_robot(problem: Problem) -> Robot:
         RecipeError: The URDF cannot be read, or joints, tip, base configuration and limits do not fit it.
     """
     spec, limits = problem.robot, problem.limits
-    urdf = problem.path.parent / spec.urdf
-    model = _reduced_model(urdf, spec.joints)
-    if not model.existFrame(spec.tip):
-        known = [frame.name for frame in model.frames]
-        raise RecipeError(
-            [f"{problem.path}: robot.tip: {urdf.name} has no frame {spec.tip!r}{nearest(spec.tip, known)}"]
-        )
+    try:
+        model = _reduced_model(problem.urdf_path, spec.joints)
+        chain = chain_from_model(model, spec.tip)
+    except RecipeError as error:
+        raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
     velocity = limits.velocity_scale * np.array(model.velocityLimit)
     middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
     robot = Robot(
-        urdf=urdf,
+        urdf=problem.urdf_path,
         joint_names=tuple(spec.joints),
         tip=spec.tip,
         position_lower=middle - half,
@@ -97,7 +95,7 @@ def load_robot(problem: Problem) -> Robot:
         torque_limit=limits.torque_scale * np.array(model.effortLimit),
         rated_velocity=np.array(model.velocityLimit),
         base=np.array(spec.base),
-        chain=chain_from_model(model, spec.tip),
+        chain=chain,
     )
     _check(problem, robot)
     return robot

@@ -1,0 +1,94 @@
+"""``cnpgen list``: the recipes that cnpgen ships, and the kinds of stages and constraints that recipes are made of."""
+
+import argparse
+from typing import Any
+
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+
+WHAT = ("datasets", "pipelines", "problems", "stages", "constraints")
+
+_HOW = {
+    "datasets": "cnpgen make-dataset NAME",
+    "pipelines": "cnpgen show NAME --kind pipeline",
+    "problems": "cnpgen show NAME --kind problem",
+    "stages": "cnpgen show --stage NAME",
+    "constraints": "cnpgen show --constraint NAME",
+}
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "list", run, title="list datasets, pipelines, problems, stages and constraints")
+    parser.add_argument("what", nargs="?", choices=WHAT, metavar="WHAT", help=f"one of {', '.join(WHAT)}; default all")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.store.documents import plain, render
+
+    found = {what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)}
+    print(render(plain(found)) if arguments.json else "\n\n".join(_section(*item) for item in found.items()))
+    return 0
+
+
+def list_all(what: str) -> list[dict[str, Any]]:
+    """List the recipes of one kind, or the kinds of stages or constraints, each with its name, title and size.
+
+    Args:
+        what: One of ``WHAT``.
+    """
+    from cnpgen import library, plugins
+
+    noun = what.removesuffix("s")
+    if noun == "stage" or noun == "constraint":
+        group = plugins.STAGES if noun == "stage" else plugins.CONSTRAINTS
+        return [{"name": name, "title": _summary(group, name)} for name in plugins.names(group)]
+    entries = {"dataset": _dataset, "pipeline": _pipeline, "problem": _problem}
+    kinds: dict[str, library.Kind] = {"dataset": "dataset", "pipeline": "pipeline", "problem": "problem"}
+    return [entries[noun](name) | {"file": file} for name, file in library.list_recipes(kinds[noun]).items()]
+
+
+def _dataset(name: str) -> dict[str, Any]:
+    from cnpgen.library import load_dataset_recipe
+
+    recipe = load_dataset_recipe(name)
+    rows = sum(recipe.splits.values())
+    size = {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
+    return {"name": name, "title": recipe.title, "version": recipe.version, "pipeline": recipe.pipeline.name, **size}
+
+
+def _pipeline(name: str) -> dict[str, Any]:
+    from cnpgen.library import load_pipeline
+
+    recipe = load_pipeline(name)
+    stages = len(recipe.stage)
+    return {"name": name, "title": recipe.title, "problem": recipe.problem.name, "size": f"{stages} stages", "stages": stages}
+
+
+def _problem(name: str) -> dict[str, Any]:
+    from cnpgen.library import load_problem
+
+    recipe = load_problem(name)
+    joints, constraints = len(recipe.robot.joints), len(recipe.constraint)
+    size = f"{joints} joints, {constraints} constraints"
+    return {"name": name, "title": recipe.title, "size": size, "joints": joints, "constraints": constraints}
+
+
+def _summary(group: str, name: str) -> str:
+    """Return one line about a kind; a broken plug-in must not hide the others."""
+    from cnpgen import plugins
+    from cnpgen.describe import kind_summary
+    from cnpgen.errors import RecipeError
+
+    try:
+        return kind_summary(plugins.load(group, name))
+    except RecipeError as error:
+        return f"(broken: {error})"
+
+
+def _section(what: str, entries: list[dict[str, Any]]) -> str:
+    from cnpgen.describe import table
+
+    rows = [(entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"]) for entry in entries]
+    return "\n".join([f"{what}  ({_HOW[what]})", *(table(rows, indent="  ", one_line=True) if rows else ["  none"])])

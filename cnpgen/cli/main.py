@@ -1,0 +1,154 @@
+"""The entry of the command line: parse, run one command, turn what goes wrong into a line and an exit code."""
+
+import argparse
+import io
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn
+
+from cnpgen.cli import (
+    doctor_command,
+    inspect_command,
+    list_command,
+    make_command,
+    show_command,
+    validate_command,
+)
+from cnpgen.cli.parser import Parser, add_debug
+from cnpgen.errors import CnpgenError, MachineError, RecipeError
+
+_COMMANDS = (make_command, list_command, show_command, inspect_command, validate_command, doctor_command)
+
+_DESCRIPTION = "Make, inspect and prove datasets of boundary problems for kinodynamic motion planning."
+
+_EPILOG = """\
+examples:
+  cnpgen list                                        what there is
+  cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
+  cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
+  cnpgen validate airhockey-hit-v1 --deep            prove them with Pinocchio and Coal
+
+stdout is data, stderr everything else. Exit codes:
+  0    done
+  1    the answer is no: the dataset is damaged, unfinished or not valid
+  2    a wrong argument or a mistake in a recipe
+  3    the machine: no compiler, a full disk, a broken library; also an internal error of cnpgen
+  130  interrupted; finished shards are kept, the same command goes on
+  141  whoever read stdout went away
+"""
+
+INTERRUPTED, NOBODY_READS = 130, 141  # 128 + SIGINT, 128 + SIGPIPE, as shells have it
+
+
+class _Version(argparse.Action):
+    """Print the version; looking it up takes milliseconds, so it is done on demand."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from importlib.metadata import PackageNotFoundError, version
+
+        found = "(not installed)"
+        with suppress(PackageNotFoundError):
+            found = version("cnpgen")
+        print(f"cnpgen {found}")
+        parser.exit()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: The arguments; those of the process by default.
+
+    Returns:
+        The exit code, as ``cnpgen --help`` lists them.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a title must not stop a terminal that cannot show it
+    with _warnings_on_one_line():
+        try:
+            code = _run(words)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            return _leave_pipe()
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the boundary of the process
+            if "--debug" in words:
+                traceback.print_exc()
+            return _report(error)
+    return code
+
+
+def _run(words: list[str]) -> int:
+    parser = build_parser()
+    try:
+        arguments, extras = parser.parse_known_args(words)
+    except SystemExit:  # --help and --version have printed what they have to say
+        return 0
+    chosen: Parser = getattr(arguments, "parser", parser)
+    if extras:
+        chosen.refuse(extras)
+    if chosen is parser:
+        parser.print_help(sys.stderr)
+        return 2
+    code: int = arguments.run(arguments)
+    return code
+
+
+def build_parser() -> Parser:
+    """Build the parser of all commands."""
+    parser = Parser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
+    add_debug(parser)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+    for command in _COMMANDS:
+        command.add(commands)
+    return parser
+
+
+def _report(error: BaseException) -> int:
+    """Print an error as one line per mistake; return its exit code."""
+    if isinstance(error, KeyboardInterrupt):
+        print("cnpgen: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    lines, code = _explain(error)
+    for line in lines:
+        print(f"cnpgen: error: {line}", file=sys.stderr)
+    return code
+
+
+def _explain(error: BaseException) -> tuple[Sequence[str], int]:
+    """Return the lines that tell an error to a user, and the exit code."""
+    if isinstance(error, RecipeError):
+        return error.mistakes, error.exit_code
+    if isinstance(error, CnpgenError):
+        return [str(error)], error.exit_code
+    code = MachineError.exit_code
+    if isinstance(error, ImportError):
+        return [f"{error}; 'cnpgen doctor' says what is wrong with this installation"], code
+    if isinstance(error, MemoryError):
+        return ["out of memory; fewer --workers need less"], code
+    if isinstance(error, OSError) and error.strerror:
+        return [f"{error.filename or 'the system'}: {error.strerror}"], code
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return [f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"], code
+
+
+def _leave_pipe() -> int:
+    """Give stdout somewhere to go, so that Python does not complain when it flushes it at exit."""
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return NOBODY_READS
+
+
+@contextmanager
+def _warnings_on_one_line() -> Iterator[None]:
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        print(f"cnpgen: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield

@@ -1,0 +1,156 @@
+"""``cnpgen make-dataset``: make a dataset, or go on with one that was interrupted."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.progress import Meter
+
+if TYPE_CHECKING:
+    from cnpgen.make import MadeDataset
+    from cnpgen.recipes import DatasetRecipe
+    from cnpgen.store.outcome import Outcome
+    from cnpgen.store.plan import DatasetPlan, ShardTask
+
+INTERRUPTED = "interrupted: finished shards are kept, run the same command again to go on"
+
+_TEXT = """\
+The same recipe, seed and backend give the same rows, however the work is shared out: --workers, --shard-size and
+--part decide which process makes which rows, never what is in them; a smaller --n gives the first rows of each split.
+The folder of the dataset is printed on stdout.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "make-dataset", run, title="make a dataset, or go on with it", text=_TEXT)
+    option = parser.add_argument
+    option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
+    option("--n", metavar="N", type=values.rows, help="rows of all splits together; default the recipe's")
+    option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
+    option("--out", metavar="DIR", type=Path, help="folder of the dataset; default NAME-vMAJOR here")
+    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    option("--shard-size", metavar="R", type=values.positive, help="rows per file, a multiple of 4096")
+    option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
+    option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")
+    option("--part", metavar="K/M", type=values.part, help="make the K-th of M parts only (0/M to M-1/M), for job arrays")
+    option("--force", action="store_true", help="replace another dataset that is in the folder")
+    option("--dry-run", action="store_true", help="print what would be made, and write nothing")
+    option("--quiet", action="store_true", help="no progress and no summary")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.library import load_dataset_recipe
+
+    recipe = load_dataset_recipe(arguments.recipe)
+    if arguments.dry_run:
+        from cnpgen.cli.plan_text import plan_text
+
+        print(plan_text(recipe, **_settings(arguments), force=arguments.force))
+        return 0
+    try:
+        _make(recipe, arguments)
+    except KeyboardInterrupt:
+        print(f"cnpgen: {INTERRUPTED}", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, object]:
+    """Return the arguments that decide what the dataset is."""
+    return {name: getattr(arguments, name) for name in ("out", "n", "seed", "shard_size", "dtype", "backend")}
+
+
+def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
+    from cnpgen.make import make_dataset
+
+    folder = arguments.out or default_folder(recipe)
+    tasks, there = _scope(recipe, folder, arguments)
+    initial = sum(task.rows for task in there)
+    meter = Meter(str(folder), sum(task.rows for task in tasks), initial, quiet=arguments.quiet)
+    try:
+        made = make_dataset(
+            recipe,
+            folder,
+            n=arguments.n,
+            seed=arguments.seed,
+            workers=arguments.workers,
+            shard_size=arguments.shard_size,
+            dtype=arguments.dtype,
+            backend=arguments.backend,
+            force=arguments.force,
+            part=arguments.part,
+            progress=meter,
+        )
+    finally:
+        meter.close()
+    if not arguments.quiet:
+        print("\n".join(_summary(made, meter)), file=sys.stderr)
+    print(made.folder)
+
+
+def default_folder(recipe: "DatasetRecipe") -> Path:
+    """Return the folder that a dataset is made in unless another is given."""
+    return Path(f"{recipe.name}-v{recipe.version.partition('.')[0]}")
+
+
+def _scope(
+    recipe: "DatasetRecipe", folder: Path, arguments: argparse.Namespace
+) -> tuple[list["ShardTask"], list["ShardTask"]]:
+    """List the shards that this run is about, and those of them that are there already."""
+    from cnpgen.recipes import split_rows
+    from cnpgen.store.plan import ShardTask, default_shard_size
+    from cnpgen.store.record import is_committed
+
+    total = arguments.n or sum(recipe.splits.values())
+    begun = _begun(recipe, folder, total, arguments)
+    size = arguments.shard_size or (begun.shard_size if begun else default_shard_size(total))
+    tasks = [
+        ShardTask(split, index, first, min(size, rows - first))
+        for split, rows in split_rows(recipe, total).items()
+        for index, first in enumerate(range(0, rows, size))
+    ]
+    k, m = arguments.part or (0, 1)
+    mine = tasks[k::m]
+    return mine, [task for task in mine if begun and is_committed(folder, task, begun.fingerprint)]
+
+
+def _begun(
+    recipe: "DatasetRecipe", folder: Path, total: int, arguments: argparse.Namespace
+) -> "DatasetPlan | None":
+    """Return the plan in the folder if it is, as far as can be told without building kernels, the one to go on with."""
+    from cnpgen.recipes import recipe_digest, split_rows
+    from cnpgen.store.layout import PLAN
+    from cnpgen.store.plan import load_plan
+
+    if arguments.force or not (folder / PLAN).is_file():
+        return None
+    plan = load_plan(folder)
+    seed = recipe.seed if arguments.seed is None else arguments.seed
+    wanted = (split_rows(recipe, total), recipe_digest(recipe), seed, arguments.dtype)
+    return plan if (plan.splits, plan.recipe_sha256, plan.seed, plan.dtype) == wanted else None
+
+
+def _summary(made: "MadeDataset", meter: Meter) -> list[str]:
+    """Say in a line or two what was done."""
+    splits = ", ".join(f"{split} {rows:,}" for split, rows in made.plan.splits.items())
+    total = f"{sum(made.plan.splits.values()):,} rows ({splits})"
+    if made.complete and not made.made:
+        return [f"already complete: {total}"]
+    seconds = meter.seconds
+    speed = f"{made.made:,} rows made in {seconds:.1f} s, {made.made / max(seconds, 1e-9):,.0f} rows/s"
+    lines = [f"complete: {total}; {speed}" if made.complete else f"{speed}; other parts of {total} are still to be made"]
+    return [*lines, *([_yield(meter.outcome)] if meter.outcome else [])]
+
+
+def _yield(outcome: "Outcome") -> str:
+    """Say how many draws were accepted and why most of the others were not."""
+    tried = max(outcome.tried, 1)
+    worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]
+    reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count)
+    text = f"accepted {outcome.accepted / tried:.1%} of {outcome.tried:,} draws"
+    return f"{text}; most of the others: {reasons}" if reasons else text

@@ -1,0 +1,73 @@
+"""argparse with errors of one line that name what was probably meant."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from cnpgen.errors import UsageError, nearest
+
+Command = Callable[[argparse.Namespace], int]
+"""What a command runs: a function of the parsed arguments that returns the exit code."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises UsageError instead of printing its usage and leaving."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(
+            allow_abbrev=False,  # a script must not break when an option is added
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            **options,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """Raise UsageError: what is wrong and where to read more, on one line."""
+        raise UsageError(f"{message.removeprefix('argument ')}; see '{self.prog} --help'")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is None or value in action.choices:
+            return
+        known = list(action.choices)
+        hint = nearest(str(value), known)
+        if isinstance(action, argparse._SubParsersAction):
+            self.error(f"unknown command {value!r}{hint or ', expected one of ' + ', '.join(known)}")
+        raise argparse.ArgumentError(action, f"expected one of {', '.join(known)}, got {value!r}{hint}")
+
+    def refuse(self, extras: Sequence[str]) -> NoReturn:
+        """Raise UsageError for arguments that nobody asked for."""
+        option = next((text.partition("=")[0] for text in extras if text.startswith("-")), None)
+        if option is None:
+            self.error(f"unexpected argument {extras[0]!r}")
+        self.error(f"unknown option {option!r}{nearest(option, self._option_string_actions)}")
+
+
+Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: commands are added to it
+
+
+def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title: str, text: str = "") -> Parser:
+    """Add a command.
+
+    Args:
+        commands: Where to.
+        name: What users type.
+        run: What it does.
+        title: What it does, in a few words, for the list of commands.
+        text: More about it, for its own help.
+
+    Returns:
+        Its parser, for its own arguments.
+    """
+    parser = commands.add_parser(name, help=title, description=f"{title[0].upper()}{title[1:]}.", epilog=text or None)
+    add_debug(parser, default=argparse.SUPPRESS)  # what was said before the command stays
+    parser.set_defaults(run=run, parser=parser)
+    return parser
+
+
+def add_debug(parser: Parser, *, default: Any = False) -> None:
+    """Add ``--debug``."""
+    parser.add_argument("--debug", action="store_true", default=default, help="show the traceback of an error")
+
+
+def add_json(parser: Parser) -> None:
+    """Add ``--json``."""
+    parser.add_argument("--json", action="store_true", help="write JSON")

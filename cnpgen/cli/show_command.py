@@ -1,0 +1,82 @@
+"""``cnpgen show``: a recipe, or a kind of stage or constraint, in words and numbers."""
+
+import argparse
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.errors import RecipeError, UsageError, nearest
+
+if TYPE_CHECKING:
+    from cnpgen.describe import Recipe
+    from cnpgen.library import Kind
+
+KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "show", run, title="describe a recipe, or a kind of stage or constraint")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help="a shipped dataset, pipeline or problem, or a file")
+    what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
+    what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
+    parser.add_argument("--kind", choices=KINDS, help="which one, where several recipes have the same name")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen import describe, plugins
+    from cnpgen.store.documents import plain, render
+
+    if arguments.recipe is None:
+        group, name = (plugins.STAGES, arguments.stage) if arguments.stage else (plugins.CONSTRAINTS, arguments.constraint)
+        if arguments.kind:
+            raise UsageError("--kind says which recipe is meant: it goes with NAME or FILE only")
+        print(render(plain(describe.kind_to_dict(group, name))) if arguments.json else describe.describe_kind(group, name))
+        return 0
+    recipe = load_any(arguments.recipe, arguments.kind)
+    print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
+    return 0
+
+
+def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
+    """Load a recipe of any kind; of several with the same name the one that includes the others.
+
+    Raises:
+        RecipeError: There is none, or it has mistakes.
+    """
+    from cnpgen import library
+
+    load = {"dataset": library.load_dataset_recipe, "pipeline": library.load_pipeline, "problem": library.load_problem}
+    return load[kind or _kind(name_or_path)](name_or_path)
+
+
+def _kind(name_or_path: str) -> "Kind":
+    """Find out what kind of recipe is meant."""
+    from cnpgen.library import list_recipes
+
+    path = Path(name_or_path)
+    if path.is_file():
+        return _kind_of_file(path)
+    if path.suffix == ".toml" or "/" in name_or_path or os.sep in name_or_path:
+        return "dataset"  # the error is the same for every kind: no such file
+    for kind in KINDS:
+        if name_or_path in list_recipes(kind):
+            return kind
+    known = sorted({name for kind in KINDS for name in list_recipes(kind)})
+    raise RecipeError([f"unknown recipe {name_or_path!r}{nearest(name_or_path, known)}; known: {', '.join(known)}"])
+
+
+def _kind_of_file(path: Path) -> "Kind":
+    """Tell the kind of a recipe file by its keys; a file that cannot be read is left to the loader to complain about."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError):
+        return "dataset"
+    if "robot" in table:
+        return "problem"
+    return "pipeline" if "stage" in table else "dataset"

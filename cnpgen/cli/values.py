@@ -1,0 +1,78 @@
+"""The values of options: whole numbers as people write them, parts of a job array."""
+
+import re
+from argparse import ArgumentTypeError
+from decimal import Decimal
+
+_PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
+_SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
+_LONGEST = 30  # digits; no number here has more, and very long ones take long to read
+
+
+def whole(text: str) -> int:
+    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if len(text) > _LONGEST:
+        raise ValueError(text)
+    if _PLAIN.fullmatch(text):
+        return int(text)
+    if not _SCIENTIFIC.fullmatch(text):
+        raise ValueError(text)
+    number = Decimal(text)
+    if number != number.to_integral_value():
+        raise ValueError(text)
+    return int(number)
+
+
+def _at_least(low: int, text: str, example: str) -> int:
+    try:
+        number = whole(text)
+    except ValueError:
+        number = low - 1
+    if number < low:
+        raise ArgumentTypeError(f"expected a whole number of at least {low}, such as {example}; got {text!r}")
+    return number
+
+
+def rows(text: str) -> int:
+    """Read a number of rows, at least 1."""
+    return _at_least(1, text, "120000, 120_000 or 1e6")
+
+
+def positive(text: str) -> int:
+    """Read a whole number, at least 1."""
+    return _at_least(1, text, "4")
+
+
+def natural(text: str) -> int:
+    """Read a whole number, at least 0."""
+    return _at_least(0, text, "7")
+
+
+def seed(text: str) -> int:
+    """Read a root seed, 0 to 2^63 - 1."""
+    number = natural(text)
+    if number >= 2**63:
+        raise ArgumentTypeError(f"expected a seed below 2^63, got {text!r}")
+    return number
+
+
+def part(text: str) -> tuple[int, int]:
+    """Read ``K/M``, the K-th of M parts, counted from 0."""
+    try:
+        k, m = (whole(number) for number in text.split("/"))
+    except ValueError:
+        k, m = 0, 0
+    if not 0 <= k < m:
+        raise ArgumentTypeError(f"expected K/M with 0 <= K < M, such as 0/8 for the first of eight; got {text!r}")
+    return k, m
+
+
+def plot_file(text: str) -> str:
+    """Read the name of a picture file."""
+    if not text.lower().endswith((".png", ".pdf", ".svg")):
+        raise ArgumentTypeError(f"expected a file that ends in .png, .pdf or .svg, got {text!r}")
+    return text

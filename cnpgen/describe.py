@@ -1,0 +1,234 @@
+"""Recipes in words and numbers: what ``cnpgen show`` prints."""
+
+import dataclasses
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+from cnpgen import plugins
+from cnpgen.constraints.constraint import Constraint
+from cnpgen.pipelines.stage import Stage
+from cnpgen.recipes import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved
+from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.schema import Key, Range, keys
+
+WIDTH = 100
+
+Recipe = Problem | Pipeline | DatasetRecipe
+
+LIMITS = {
+    "position_lower": "rad",
+    "position_upper": "rad",
+    "velocity_limit": "rad/s",
+    "acceleration_limit": "rad/s^2",
+    "torque_limit": "N m",
+}
+
+
+def describe(recipe: Recipe) -> str:
+    """Describe a recipe of any kind, with everything that it refers to.
+
+    Raises:
+        RecipeError: The robot's URDF does not fit the problem.
+    """
+    if isinstance(recipe, DatasetRecipe):
+        return f"{describe_dataset(recipe)}\n\n{describe(recipe.pipeline)}"
+    if isinstance(recipe, Pipeline):
+        return f"{describe_pipeline(recipe)}\n\n{describe(recipe.problem)}"
+    return describe_problem(recipe, load_robot(recipe))
+
+
+def describe_dataset(recipe: DatasetRecipe) -> str:
+    """Describe how many rows a dataset has, from which seed, split how."""
+    splits = ", ".join(f"{name} {rows:,}" for name, rows in recipe.splits.items())
+    facts = [
+        ("rows", f"{sum(recipe.splits.values()):,}: {splits}"),
+        ("seed", str(recipe.seed)),
+        ("licence", recipe.license),
+        ("recipe", f"sha256 {recipe_digest(recipe)}"),
+        ("file", str(recipe.path)),
+    ]
+    return "\n".join([f"dataset {recipe.name} {recipe.version}", *_title(recipe.title), *table(facts, indent="  ")])
+
+
+def describe_pipeline(pipeline: Pipeline) -> str:
+    """Describe the stages of a pipeline, numbered."""
+    steps = [(f"{number}.", kind_name(stage), stage.describe()) for number, stage in enumerate(pipeline.stage, 1)]
+    steps.append(("", "(always)", "reject what does not meet every constraint exactly, on the numbers as they are stored"))
+    return "\n".join([f"pipeline {pipeline.name}", *_title(pipeline.title), *table(steps, indent="  ")])
+
+
+def describe_problem(problem: Problem, robot: Robot) -> str:
+    """Describe a problem: its robot, limits and constraints."""
+    spec = problem.robot
+    facts = [("robot", f"{spec.urdf}, {robot.n} planned joints, tip {spec.tip!r}")]
+    facts += [("object", numbers(problem.object))] if problem.object else []
+    facts += [("obstacle", f"{box.name}: {numbers(box, leave_out=('name',))}") for box in problem.obstacle]
+    facts += [("motion", numbers(problem.trajectory))]
+    constraints = [(kind_name(item), numbers(item)) for item in problem.constraint]
+    return "\n".join(
+        [
+            f"problem {problem.name}",
+            *_title(problem.title),
+            *table(facts, indent="  "),
+            "",
+            "  planning limits",
+            *table(_limit_rows(robot), indent="    "),
+            "",
+            "  constraints",
+            *table(constraints or [("none", "")], indent="    "),
+        ]
+    )
+
+
+def _limit_rows(robot: Robot) -> list[tuple[str, ...]]:
+    head = ("joint", "position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]", "torque [N m]", "base [rad]")
+    columns = (robot.velocity_limit, robot.acceleration_limit, robot.torque_limit, robot.base)
+    ranges = zip(robot.position_lower, robot.position_upper, strict=True)
+    rows = zip(robot.joint_names, ranges, *columns, strict=True)
+    return [head, *((name, f"{low:.4g} to {high:.4g}", *(f"{x:.4g}" for x in rest)) for name, (low, high), *rest in rows)]
+
+
+def _title(title: str) -> list[str]:
+    return textwrap.wrap(title, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
+
+
+def numbers(obj: Any, *, leave_out: Sequence[str] = ()) -> str:
+    """List the keys of an object that was read from a table, with values and units, without those left at nothing."""
+    shown = [
+        f"{key.name} {quantity(getattr(obj, key.name), key.unit)}"
+        for key in keys(type(obj))
+        if key.name not in leave_out and (getattr(obj, key.name) != key.default or getattr(obj, key.name))
+    ]
+    return ", ".join(shown)
+
+
+def quantity(value: Any, unit: str = "1") -> str:
+    """Write a value of a recipe with its unit: ``"[0.6, 1.3] m"``."""
+    text = _number(value)
+    return text if unit == "1" or value in (None, (), "") else f"{text} {unit}"
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, Range):
+        return f"[{value.low:.6g}, {value.high:.6g}]" if value.low < value.high else f"{value.low:.6g}"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, tuple) and value:
+        joint = " x " if isinstance(value[0], Range) else ", "
+        text = joint.join(_number(item) for item in value)
+        return text if joint == " x " else f"({text})"
+    return "none" if value in (None, "", ()) else str(value)
+
+
+def kind_name(item: Stage | Constraint) -> str:
+    """Return the name under which the kind of a stage or constraint is registered."""
+    group = plugins.STAGES if isinstance(item, Stage) else plugins.CONSTRAINTS
+    return plugins.name_of(group, type(item))
+
+
+def kind_summary(kind: type) -> str:
+    """Return the first line of a kind's documentation, without markup."""
+    return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "")
+
+
+def describe_kind(group: str, name: str) -> str:
+    """Describe a kind of stage or constraint: what it does, and the keys of its table.
+
+    Args:
+        group: ``plugins.STAGES`` or ``plugins.CONSTRAINTS``.
+        name: Name of the kind.
+
+    Raises:
+        RecipeError: There is no such kind.
+    """
+    kind = plugins.load(group, name)
+    head = ("key", "default", "value", "meaning")
+    rows = [(key.name, _default(key), _expected(key), key.doc) for key in keys(kind)]
+    noun = plugins.BASES[group].__name__.lower()
+    text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
+    return "\n".join([f"{noun} {name}", *_title(kind_summary(kind)), "", *text])
+
+
+def _default(key: Key) -> str:
+    return "required" if key.required else quantity(key.default, key.unit)
+
+
+def _expected(key: Key) -> str:
+    bounds = [f">= {key.low:g}" if key.low is not None else "", f"<= {key.high:g}" if key.high is not None else ""]
+    return ", ".join([key.expected, *filter(None, bounds)])
+
+
+def kind_to_dict(group: str, name: str) -> dict[str, Any]:
+    """Describe a kind of stage or constraint for JSON.
+
+    Raises:
+        RecipeError: There is no such kind.
+    """
+    kind = plugins.load(group, name)
+    left_out = ("hint", "default")
+    entries = [
+        {
+            **{field.name: getattr(key, field.name) for field in dataclasses.fields(key) if field.name not in left_out},
+            "expected": key.expected,
+            "required": key.required,
+            **({} if key.required else {"default": _plain_default(key.default)}),
+        }
+        for key in keys(kind)
+    ]
+    noun = plugins.BASES[group].__name__.lower()
+    return {"kind": noun, "name": name, "summary": kind_summary(kind), "keys": entries}
+
+
+def _plain_default(value: Any) -> Any:
+    return [value.low, value.high] if isinstance(value, Range) else value
+
+
+def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
+    """Describe a recipe for JSON: everything it refers to resolved, in SI units, and what follows from it.
+
+    Raises:
+        RecipeError: The robot's URDF does not fit the problem.
+    """
+    pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
+    problem = pipeline.problem if isinstance(pipeline, Pipeline) else pipeline
+    robot = load_robot(problem)
+    content: dict[str, Any] = {"kind": _noun(recipe), "file": str(recipe.path), "recipe": resolved(recipe)}
+    if isinstance(pipeline, Pipeline):
+        content["recipe_sha256"] = recipe_digest(pipeline)
+        content["stages"] = [{"use": kind_name(stage), "text": stage.describe()} for stage in pipeline.stage]
+    content["joints"] = list(robot.joint_names)
+    content["limits"] = {name: {"unit": unit, "values": list(getattr(robot, name))} for name, unit in LIMITS.items()}
+    return content
+
+
+def _noun(recipe: Recipe) -> str:
+    return {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[type(recipe)]
+
+
+def table(
+    rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[int] = (), one_line: bool = False
+) -> list[str]:
+    """Lay out rows as aligned columns that fit into ``WIDTH``.
+
+    Args:
+        rows: The cells, in rows of the same length.
+        indent: Put before every line.
+        right: The columns that are aligned to the right.
+        one_line: Whether to cut what does not fit into the last column; it is wrapped by default.
+
+    Returns:
+        The lines.
+    """
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
+    hanging = indent + " " * (sum(widths) + 2 * len(widths))
+    room = max(WIDTH - len(hanging), 30)
+    lines = []
+    for *cells, last in rows:
+        pairs = enumerate(zip(cells, widths, strict=True))
+        head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
+        parts = textwrap.wrap(last, room, break_on_hyphens=False, max_lines=1 if one_line else None, placeholder=" ...")
+        lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
+    return lines

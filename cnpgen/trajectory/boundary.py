@@ -1,0 +1,119 @@
+"""Boundary control points: position, velocity and acceleration at the ends, exactly (paper, Appendix A)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Boundary conditions of N motions of n joints.
+
+    Attributes:
+        start_q: Start positions [rad], shape (N, n).
+        start_dq: Start velocities [rad/s].
+        start_ddq: Start accelerations [rad/s^2].
+        goal_q: Goal positions [rad].
+        goal_dq: Goal velocities [rad/s].
+        goal_ddq: Goal accelerations [rad/s^2], or None where they are free.
+    """
+
+    start_q: Array
+    start_dq: Array
+    start_ddq: Array
+    goal_q: Array
+    goal_dq: Array
+    goal_ddq: Array | None = None
+
+    @property
+    def fixed_at_goal(self) -> int:
+        """Number of path control points that the goal fixes (the paper's N_d)."""
+        return 2 if self.goal_ddq is None else 3
+
+    def __len__(self) -> int:
+        return len(self.start_q)
+
+    def __getitem__(self, index: slice | Array) -> "Boundary":
+        goal = None if self.goal_ddq is None else self.goal_ddq[index]
+        parts = (self.start_q, self.start_dq, self.start_ddq, self.goal_q, self.goal_dq)
+        return Boundary(*(np.atleast_2d(part[index]) for part in parts), goal)
+
+
+def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
+    """First three path control points.
+
+    Args:
+        boundary: Boundary conditions.
+        rate: Rate control points, shape (N, R), positive.
+        spec: Degree and numbers of control points.
+
+    Returns:
+        Shape (N, 3, n).
+    """
+    path = end_derivatives(spec.path_control_points, spec.degree)
+    speed = end_derivatives(spec.rate_control_points, spec.degree)
+    slope = speed.eta * (rate[:, 1:2] - rate[:, :1])
+    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], slope=slope, path=path)
+
+
+def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
+    """Last two path control points, or three where the goal's acceleration is given, in the order of the path.
+
+    Args:
+        boundary: Boundary conditions.
+        rate: Rate control points, shape (N, R), positive.
+        spec: Degree and numbers of control points.
+
+    Returns:
+        Shape (N, 2 or 3, n).
+    """
+    path = end_derivatives(spec.path_control_points, spec.degree)
+    speed = end_derivatives(spec.rate_control_points, spec.degree)
+    # Reversed in phase, r' and p' change sign: the goal is a start with -dq.
+    slope = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
+    acceleration = np.zeros_like(boundary.goal_q) if boundary.goal_ddq is None else boundary.goal_ddq
+    points = _three(boundary.goal_q, -boundary.goal_dq, acceleration, rate[:, -1:], slope=slope, path=path)
+    return points[:, boundary.fixed_at_goal - 1 :: -1]
+
+
+def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, slope: Array, path: EndDerivatives) -> Array:
+    """Control points at s = 0 from q, dq, ddq, r(0) and r'(0)."""
+    eta, beta = path.eta, path.beta
+    first = dq / rate  # p'(0)
+    second = (ddq - first * slope * rate) / rate**2  # p''(0), from ddq = p'' r^2 + p' r' r
+    c1 = q + first / eta
+    c2 = second / beta - 2 * q + 3 * c1
+    return np.stack([q, c1, c2], axis=1)
+
+
+def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectorySpec) -> Array:
+    """Path control points from the interior ones.
+
+    Args:
+        boundary: Boundary conditions.
+        interior: Interior path control points, shape (N, C - 3 - N_d, n).
+        rate: Rate control points, shape (N, R).
+        spec: Degree and numbers of control points.
+
+    Returns:
+        Shape (N, C, n).
+    """
+    return np.concatenate([start_points(boundary, rate, spec), interior, goal_points(boundary, rate, spec)], axis=1)
+
+
+def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
+    """Interior control points for network outputs of zero: the line from C_2 to C_{C - N_d} (paper, eq. configuration points).
+
+    Returns:
+        Shape (N, C - 3 - N_d, n).
+    """
+    first, last = start_points(boundary, rate, spec)[:, 2:3], goal_points(boundary, rate, spec)[:, :1]
+    count = spec.path_control_points - 3 - boundary.fixed_at_goal
+    along = np.linspace(0, 1, count)[:, None]
+    return first * (1 - along) + last * along

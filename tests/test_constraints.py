@@ -1,0 +1,336 @@
+"""Every kind of constraint: its symbolic form against its measurement, and a met and a violated case of each."""
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.constraints.constraint import EXACTNESS, Condition, Constraint
+from cnpgen.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.constraints.table import Table
+from cnpgen.constraints.vertical import Vertical
+from cnpgen.library import load_problem
+from cnpgen.plugins import CONSTRAINTS, load, names
+from cnpgen.recipes import LimitSpec, Problem, RobotSpec
+from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.schema import Range
+from cnpgen.verify.world import World
+
+AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
+
+# Three sliding axes, a turn about z and a lean about x: what it holds is upright unless it leans.
+GANTRY_JOINTS = [
+    ("slide_x", "prismatic", "0 0 3", "1 0 0"),
+    ("slide_y", "prismatic", "0 0 0", "0 1 0"),
+    ("slide_z", "prismatic", "0 0 -1.6", "0 0 1"),
+    ("turn", "revolute", "0 0 -0.2", "0 0 1"),
+    ("lean", "revolute", "0 0 -0.3", "1 0 0"),
+    ("grip", "fixed", "0 0 -0.25", "1 0 0"),
+]
+
+
+def gantry_urdf() -> str:
+    parts = ['<robot name="gantry"><link name="world"/>']
+    parent = "world"
+    for name, kind, xyz, axis in GANTRY_JOINTS:
+        inertia = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>'
+        parts.append(f'<link name="{name}_link"><inertial><mass value="2"/>{inertia}</inertial></link>')
+        parts.append(f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{name}_link"/>')
+        parts.append(f'<origin xyz="{xyz}"/><axis xyz="{axis}"/>')
+        parts.append('<limit lower="-1" upper="1" velocity="1" effort="200"/></joint>')
+        parent = f"{name}_link"
+    return "".join([*parts, "</robot>"])
+
+
+@pytest.fixture(scope="module")
+def gantry(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    folder = tmp_path_factory.mktemp("gantry")
+    (folder / "gantry.urdf").write_text(gantry_urdf())
+    joints = tuple(name for name, kind, *_ in GANTRY_JOINTS if kind != "fixed")
+    spec = RobotSpec(urdf="gantry.urdf", joints=joints, tip="grip_link", base=(0.0,) * 5)
+    return replace(HEAVY, name="gantry", robot=spec, limits=LimitSpec(), path=folder / "problem.toml")
+
+
+class Bench:
+    """A problem's robot with both views of it: the world, and a constraint's symbolic forms as CasADi functions."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.robot = problem, load_robot(problem)
+        self.world = World(problem, self.robot)
+
+    def state(self, q: Any, dq: Any = 0.0, ddq: Any = 0.0, tops: Any = -5.0) -> World:
+        n, m = self.robot.n, len(self.problem.obstacle)
+        self.world.set_state(
+            *(np.broadcast_to(x, n).astype(float) for x in (q, dq, ddq)), np.broadcast_to(tops, m) * 1.0
+        )
+        return self.world
+
+    def random_state(self, random: np.random.Generator) -> list[np.ndarray]:
+        robot = self.robot
+        q = random.uniform(robot.position_lower, robot.position_upper)
+        return [
+            q,
+            random.normal(size=robot.n),
+            5 * random.normal(size=robot.n),
+            random.uniform(-0.2, 0.8, len(self.problem.obstacle)),
+        ]
+
+    def symbolic(self, constraint: Constraint) -> tuple[ca.Function, list[tuple[Condition, ...]]]:
+        columns = [symbols(name, self.robot.n) for name in ("q", "dq", "ddq")] + [
+            symbols("tops", len(self.problem.obstacle))
+        ]
+        (q, dq, ddq, tops), size = [scalars for _, scalars in columns], self.problem.object
+        state = SymbolicState(self.robot, q, dq, ddq, tops, self.problem.obstacle, size.size if size else None)
+        forms = [constraint.symbolic(state), *(constraint.symbolic_at(state, end) for end in ("start", "goal"))]
+        outputs = [ca.vertcat(*(g for condition in form for g in condition.g)) for form in forms]
+        return ca.Function("forms", [column for column, _ in columns], outputs), forms
+
+
+@pytest.fixture(scope="module")
+def benches(gantry: Problem) -> dict[str, Bench]:
+    return {problem.name: Bench(problem) for problem in (AIRHOCKEY, HEAVY, gantry)}
+
+
+KINDS = {
+    "joint-position": JointPosition(tolerance=1e-3),
+    "joint-velocity": JointVelocity(tolerance=1e-3),
+    "joint-acceleration": JointAcceleration(tolerance=1e-2),
+    "joint-torque": JointTorque(tolerance=0.1),
+    "table": Table(x=Range(0.6, 2.0), y=Range(-0.45, 0.45), z=0.16, start_band=0.005, tolerance=1e-3),
+    "vertical": Vertical(tolerance=0.01),
+    "robot-clearance": RobotClearance(radius=0.14, tolerance=1e-3),
+    "object-contact": ObjectContact(depth=1e-3, tolerance=1e-3),
+}
+
+
+def measured_forms(constraint: Constraint, world: World) -> list[tuple[Condition, ...]]:
+    return [constraint.measured(world), *(constraint.measured_at(world, end) for end in ("start", "goal"))]
+
+
+def values(form: tuple[Condition, ...]) -> np.ndarray:
+    return np.array([g for condition in form for g in condition.g], float)
+
+
+def test_every_shipped_kind_is_tested_here():
+    built_in = [name for name in names(CONSTRAINTS) if load(CONSTRAINTS, name).__module__.startswith("cnpgen.")]
+    assert {name: load(CONSTRAINTS, name) for name in built_in} == {name: type(kind) for name, kind in KINDS.items()}
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "object-contact"])
+@pytest.mark.parametrize("problem", ["airhockey", "heavy-object", "gantry"])
+def test_symbolic_form_agrees_with_the_measurement(benches, problem, name):
+    bench, random = benches[problem], np.random.default_rng(4)
+    if name == "robot-clearance" and not bench.problem.obstacle:
+        bench = Bench(replace(bench.problem, obstacle=HEAVY.obstacle))
+    function, _ = bench.symbolic(KINDS[name])
+    for _ in range(40):
+        state = bench.random_state(random)
+        found = [np.array(value).ravel() for value in function(*state)]
+        bench.world.set_state(*state)
+        for symbolic, measured in zip(found, measured_forms(KINDS[name], bench.world), strict=True):
+            np.testing.assert_allclose(symbolic, values(measured), rtol=1e-12, atol=1e-9)
+
+
+def test_symbolic_contact_of_an_upright_object_agrees_with_the_measurement(benches):
+    bench, random = benches["gantry"], np.random.default_rng(5)
+    function, _ = bench.symbolic(KINDS["object-contact"])
+    overlapping = 0
+    for _ in range(300):
+        q, dq, ddq, tops = bench.random_state(random)
+        q[:2], q[4] = (random.uniform(0.1, 0.7), random.uniform(-0.7, 0.7)), 0.0
+        found = [np.array(value).ravel() for value in function(q, dq, ddq, tops)]
+        bench.world.set_state(q, dq, ddq, tops)
+        for symbolic, measured in zip(found, measured_forms(KINDS["object-contact"], bench.world), strict=True):
+            expected = values(measured)
+            np.testing.assert_allclose(np.minimum(symbolic, 0.0), np.minimum(expected, 0.0), atol=1e-9)
+            assert np.all(symbolic <= expected + 1e-9)  # apart: along a face normal, not the distance
+        overlapping += np.any(expected < 0)
+    assert overlapping > 50
+
+
+@pytest.mark.parametrize("name", list(KINDS))
+def test_both_forms_state_the_same_conditions(benches, name):
+    bench = benches["heavy-object"]
+    _, forms = bench.symbolic(KINDS[name])
+    for symbolic, measured in zip(forms, measured_forms(KINDS[name], bench.state(0.1)), strict=True):
+        for a, b in zip(symbolic, measured, strict=True):
+            assert (a.name, a.unit, a.exactness, a.needs, len(a.g)) == (b.name, b.unit, b.exactness, b.needs, len(b.g))
+            np.testing.assert_array_equal(a.lower, b.lower)
+            np.testing.assert_array_equal(a.upper, b.upper)
+            assert len(a.g) == len(a.lower) == len(a.upper)
+            assert a.exactness in EXACTNESS["float64"]
+
+
+@pytest.mark.parametrize("name", list(KINDS))
+def test_conditions_depend_on_no_higher_derivative_than_they_say(benches, name):
+    bench, random = benches["heavy-object"], np.random.default_rng(6)
+    q, dq, ddq, tops = bench.random_state(random)
+    forms = []
+    for order in (2, 1, 0):
+        bench.world.set_state(q, dq if order > 0 else 0 * dq, ddq if order > 1 else 0 * ddq, tops)
+        forms.append([c for form in measured_forms(KINDS[name], bench.world) for c in form])
+    for full, no_ddq, still in zip(*forms, strict=True):
+        if full.needs < 2:
+            assert full.g == no_ddq.g
+        if full.needs < 1:
+            assert full.g == still.g
+        else:
+            assert full.g != still.g
+
+
+# --- met and violated -------------------------------------------------------------------------------------------------
+
+
+def out_of_bounds(form: tuple[Condition, ...]) -> dict[str, float]:
+    """Conditions that a float64 boundary state must not break, and by how much it does."""
+    broken = {}
+    for condition in form:
+        g = np.array(condition.g, float)
+        excess = np.maximum(condition.lower - g, g - condition.upper)
+        if np.any(excess > condition.slack("float64")):
+            broken[condition.name] = condition.violation()
+    return broken
+
+
+def expect(
+    constraint: Constraint, world: World, broken: dict[str, float], *, at: tuple[str, ...] = ("motion", "start", "goal")
+) -> None:
+    forms = dict(zip(("motion", "start", "goal"), measured_forms(constraint, world), strict=True))
+    for level in at:
+        found = out_of_bounds(forms[level])
+        assert found == pytest.approx(broken, rel=1e-6, abs=1e-9), level
+
+
+def test_joint_position_is_met_on_the_limit_and_violated_beyond(benches):
+    bench = benches["airhockey"]
+    upper, lower = bench.robot.position_upper, bench.robot.position_lower
+    expect(KINDS["joint-position"], bench.state(upper), {})
+    expect(KINDS["joint-position"], bench.state(lower), {})
+    expect(KINDS["joint-position"], bench.state(upper + 1e-3 * (np.arange(6) == 2)), {"joint position": 1e-3})
+    expect(KINDS["joint-position"], bench.state(lower - [0, 2e-6, 0, 0, 0, 1e-6]), {"joint position": 2e-6})
+
+
+@pytest.mark.parametrize(("name", "what"), [("velocity", "dq"), ("acceleration", "ddq")])
+def test_joint_rates_are_met_on_the_limit_and_violated_beyond(benches, name, what):
+    bench = benches["airhockey"]
+    limit = getattr(bench.robot, f"{name}_limit")
+    kind, sign = KINDS[f"joint-{name}"], np.array([1, -1, 1, -1, 1, -1])
+    expect(kind, bench.state(bench.robot.base, **{what: limit * sign}), {})
+    expect(
+        kind, bench.state(bench.robot.base, **{what: sign * limit + [0, -1e-3, 0, 0, 0, 0]}), {f"joint {name}": 1e-3}
+    )
+    over = limit * (1 + 1e-9)
+    expect(kind, bench.state(bench.robot.base, **{what: over}), {f"joint {name}": 1e-9 * limit.max()})
+
+
+def test_joint_torque_is_met_at_rest_and_violated_by_a_hard_acceleration(benches):
+    bench = benches["heavy-object"]
+    model, limit, q = bench.robot.model, bench.robot.torque_limit, np.full(7, 0.3)
+    expect(KINDS["joint-torque"], bench.state(q), {})
+    mass = pin.crba(model, model.createData(), q)
+    gravity = pin.rnea(model, model.createData(), q, np.zeros(7), np.zeros(7))
+    wanted = np.where(np.arange(7) == 3, -limit, 0.0)
+    expect(KINDS["joint-torque"], bench.state(q, ddq=np.linalg.solve(mass, wanted * (1 - 1e-9) - gravity)), {})
+    expect(
+        KINDS["joint-torque"],
+        bench.state(q, ddq=np.linalg.solve(mass, wanted * 1.01 - gravity)),
+        {"joint torque": 0.01 * limit[3]},
+    )
+
+
+def at_tip(robot: Robot, target: list[float]) -> np.ndarray:
+    """Solve ``FK(q) = target`` from the base configuration."""
+    model, data, q = robot.model, robot.model.createData(), robot.base.copy()
+    frame, local = model.getFrameId(robot.tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for _ in range(50):
+        jacobian = pin.computeFrameJacobian(model, data, q, frame, local)[:3]
+        q += np.linalg.pinv(jacobian) @ (np.array(target) - pin.updateFramePlacement(model, data, frame).translation)
+    return q
+
+
+def vertical_gain(bench: Bench, q: np.ndarray) -> np.ndarray:
+    model, local = bench.robot.model, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    return pin.computeFrameJacobian(model, model.createData(), q, model.getFrameId(bench.robot.tip), local)[2]
+
+
+def test_table_is_met_on_its_edge_and_violated_beside_it(benches):
+    bench, table = benches["airhockey"], KINDS["table"]
+    expect(table, bench.state(at_tip(bench.robot, [0.7, 0.45, 0.16])), {})
+    expect(table, bench.state(at_tip(bench.robot, [0.6 - 1e-6, 0.1, 0.16])), {"table rectangle": 1e-6})
+    expect(table, bench.state(at_tip(bench.robot, [0.8, -0.46, 0.16])), {"table rectangle": 0.01})
+    expect(
+        table, bench.state(at_tip(bench.robot, [0.8, 0.1, 0.16 - 1e-6])), {"table height": 1e-6}, at=("motion", "goal")
+    )
+
+
+def test_a_motion_may_start_in_the_band_above_and_below_the_table(benches):
+    bench, table = benches["airhockey"], KINDS["table"]
+    for offset in (-0.005, 0.005):
+        world = bench.state(at_tip(bench.robot, [0.8, 0.1, 0.16 + offset]))
+        expect(table, world, {}, at=("start",))
+        expect(table, world, {"table height": 0.005}, at=("motion", "goal"))
+    expect(table, bench.state(at_tip(bench.robot, [0.8, 0.1, 0.166])), {"table height": 0.001}, at=("start",))
+
+
+def test_tip_must_move_along_the_table_at_both_ends(benches):
+    bench, table = benches["airhockey"], KINDS["table"]
+    q = at_tip(bench.robot, [0.8, 0.1, 0.16])
+    gain = vertical_gain(bench, q)
+    lift = gain / (gain @ gain)  # lifts the tip by 1
+    dq = np.linspace(-1, 1, 6) - lift * (gain @ np.linspace(-1, 1, 6))
+    bias = bench.state(q, dq).tip_acceleration[2]
+    expect(table, bench.state(q, dq, -lift * bias), {})
+    expect(table, bench.state(q, dq, lift * (1e-6 - bias)), {"vertical acceleration": 1e-6}, at=("start", "goal"))
+    expect(table, bench.state(q, 1e-6 * lift), {"vertical velocity": 1e-6}, at=("start", "goal"))
+    expect(table, bench.state(q, 1e-6 * lift), {}, at=("motion",))
+
+
+def test_vertical_is_met_by_an_upright_object_and_violated_by_a_lean(benches):
+    bench, vertical = benches["gantry"], KINDS["vertical"]
+    expect(vertical, bench.state([0.3, -0.2, 0.1, 0.7, 0.0]), {})
+    expect(vertical, bench.state([0.3, -0.2, 0.1, 0.0, 1e-6]), {"tilt": 1e-6})
+    expect(vertical, bench.state([0.3, -0.2, 0.1, 0.0, np.pi]), {"upright": 1.0})
+
+
+def test_robot_clearance_is_met_at_the_radius_and_violated_closer(benches):
+    bench, clearance = benches["gantry"], KINDS["robot-clearance"]
+    high = [0.4, -0.45, 1.0, 0.3, 0.0]  # the tip is 1.65 m above the world, over the first pedestal
+    expect(clearance, bench.state(high, tops=[1.65 - 0.14, -5.0]), {})
+    expect(clearance, bench.state(high, tops=[1.65 - 0.14 + 1e-6, -5.0]), {"robot clearance": 1e-6})
+    expect(clearance, bench.state(high, tops=[1.8, -5.0]), {"robot clearance": 0.14})
+
+
+def test_object_contact_is_met_by_touching_and_violated_by_entering_deeper(benches):
+    bench, contact = benches["gantry"], KINDS["object-contact"]
+    high = [0.4, -0.45, 1.0, 0.3, 0.0]
+    bottom = 1.65 - 0.15
+    expect(contact, bench.state(high, tops=[bottom, -5.0]), {})
+    expect(contact, bench.state(high, tops=[bottom + 1e-3, -5.0]), {})
+    expect(contact, bench.state(high, tops=[bottom + 1e-3 + 1e-6, -5.0]), {"object contact": 1e-6})
+    expect(contact, bench.state(high, tops=[bottom + 0.05, -5.0]), {"object contact": 0.049})
+
+
+# --- conditions -------------------------------------------------------------------------------------------------------
+
+
+def condition(g: list[float], lower: list[float], upper: list[float], exactness: str = "limit") -> Condition:
+    return Condition("test", "1", g, np.array(lower, float), np.array(upper, float), exactness)
+
+
+def test_violation_is_the_worst_excess():
+    assert condition([1.0, 2.0], [0.0, -np.inf], [1.0, 1.5]).violation() == 0.5
+    assert condition([0.5], [0.0], [np.inf]).violation() == 0.0
+
+
+def test_what_is_no_number_is_an_infinite_violation():
+    assert condition([np.nan, 0.0], [0.0, 0.0], [1.0, 1.0]).violation() == np.inf
+
+
+def test_slack_of_limits_is_relative_to_them_and_of_the_rest_absolute():
+    np.testing.assert_allclose(condition([0.0, 0.0], [-300.0, -0.5], [100.0, np.inf]).slack("float64"), [3e-10, 1e-12])
+    np.testing.assert_array_equal(condition([0.0], [-300.0], [300.0], "velocity").slack("float32"), [1e-5])

@@ -1,0 +1,162 @@
+"""Loading robots: scaled limits, the skeleton, and what is said about joints, tips and URDFs that do not fit."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.errors import RecipeError
+from cnpgen.library import load_problem
+from cnpgen.recipes import Problem
+from cnpgen.robots.robot import load_robot
+
+HEAVY = load_problem("heavy-object")
+AIRHOCKEY = load_problem("airhockey")
+
+
+def changed(problem: Problem, **robot: Any) -> Problem:
+    return replace(problem, robot=replace(problem.robot, **robot))
+
+
+def with_urdf(folder: Path, old: str, new: str) -> Problem:
+    """Heavy object with the first ``old`` of its URDF replaced."""
+    text = HEAVY.urdf_path.read_text()
+    assert old in text
+    (folder / "changed.urdf").write_text(text.replace(old, new, 1))
+    return changed(replace(HEAVY, path=folder / "problem.toml"), urdf="changed.urdf")
+
+
+def mistake_of(problem: Problem) -> str:
+    with pytest.raises(RecipeError) as raised:
+        load_robot(problem)
+    (mistake,) = raised.value.mistakes
+    return mistake
+
+
+@pytest.mark.parametrize("problem", [AIRHOCKEY, HEAVY], ids=lambda problem: problem.name)
+def test_limits_are_those_of_the_urdf_scaled(problem):
+    robot, model = load_robot(problem), load_robot(problem).model
+    assert robot.n == len(problem.robot.joints) == model.nq
+    np.testing.assert_allclose(robot.position_lower, model.lowerPositionLimit, rtol=1e-15)
+    np.testing.assert_allclose(robot.position_upper, model.upperPositionLimit, rtol=1e-15)
+    np.testing.assert_allclose(robot.velocity_limit, 0.8 * np.array(model.velocityLimit), rtol=1e-15)
+    np.testing.assert_allclose(robot.torque_limit, 0.8 * np.array(model.effortLimit), rtol=1e-15)
+    np.testing.assert_array_equal(robot.base, problem.robot.base)
+
+
+def test_acceleration_limit_is_the_rate_times_the_velocity_limit_up_to_the_cap():
+    robot = load_robot(replace(HEAVY, limits=replace(HEAVY.limits, acceleration_rate=10.0, acceleration_cap=15.0)))
+    np.testing.assert_allclose(robot.acceleration_limit, np.minimum(10.0 * robot.velocity_limit, 15.0))
+    assert robot.acceleration_limit.max() == 15.0
+    assert robot.acceleration_limit.min() < 15.0
+
+
+def test_position_scale_narrows_limits_about_their_middle(tmp_path):
+    problem = with_urdf(tmp_path, 'lower="-2.9670597283903604"', 'lower="-1.0"')
+    robot = load_robot(replace(problem, limits=replace(problem.limits, position_scale=0.5)))
+    middle, half = (2.9670597283903604 - 1.0) / 2, (2.9670597283903604 + 1.0) / 4
+    assert robot.position_lower[0] == pytest.approx(middle - half)
+    assert robot.position_upper[0] == pytest.approx(middle + half)
+
+
+def test_skeleton_of_the_heavy_object_is_shoulder_elbow_wrist_object():
+    robot = load_robot(HEAVY)
+    assert robot.skeleton == ((1, 3), (3, 5), (5, 7))
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, np.linspace(-1, 1, 7))
+    points = [*(data.oMi[i].translation for i in range(1, 8)), data.oMf[model.getFrameId(robot.tip)].translation]
+    lengths = [np.linalg.norm(points[b] - points[a]) for a, b in robot.skeleton]
+    np.testing.assert_allclose(lengths, [0.42, 0.4, 0.251], atol=1e-12)
+
+
+def test_skeleton_ends_at_the_tip_where_joint_7_is_locked():
+    robot = load_robot(AIRHOCKEY)
+    assert robot.skeleton == ((1, 3), (3, 5), (5, 6))
+    assert robot.n == 6
+
+
+def test_locked_joints_in_the_middle_leave_a_bent_skeleton():
+    joints = tuple(name for name in HEAVY.robot.joints if name != "joint_4")
+    robot = load_robot(changed(HEAVY, joints=joints, base=(0.0,) * 6))
+    assert robot.joint_names == joints
+    assert robot.chain.joints[3].mass > 0
+    assert robot.skeleton[-1][1] == robot.n
+
+
+def test_unknown_joint_is_named_with_the_nearest_one():
+    mistake = mistake_of(changed(HEAVY, joints=("joint1", *HEAVY.robot.joints[1:])))
+    assert mistake.startswith(f"{HEAVY.path}: robot.joints: ")
+    assert "'joint1' (did you mean 'joint_1'?)" in mistake
+
+
+def test_unknown_tip_is_named_with_the_nearest_one():
+    mistake = mistake_of(changed(HEAVY, tip="objekt"))
+    assert mistake.startswith(f"{HEAVY.path}: robot.tip: ")
+    assert "'objekt' (did you mean 'object'?)" in mistake
+
+
+def test_tip_must_be_behind_the_last_planned_joint():
+    mistake = mistake_of(changed(HEAVY, tip="link_4"))
+    assert "robot.tip: frame 'link_4' is not moved by the last planned joint 'joint_7'" in mistake
+
+
+def test_joints_must_be_in_the_order_of_the_urdf():
+    mistake = mistake_of(changed(HEAVY, joints=HEAVY.robot.joints[::-1]))
+    assert "robot.joints: must be in the URDF's order ['joint_1', 'joint_2'," in mistake
+    assert "got ['joint_7', 'joint_6'," in mistake
+
+
+def test_base_needs_one_value_per_joint():
+    assert "robot.base: needs 7 values, one per planned joint, got 6" in mistake_of(changed(HEAVY, base=(0.0,) * 6))
+
+
+def test_base_outside_its_limits_names_the_joint_that_is_furthest_out():
+    mistake = mistake_of(changed(HEAVY, base=(0.0, 2.2, 0.0, -2.5, 0.0, 0.0, 0.0)))
+    assert "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]" in mistake
+
+
+def test_base_on_its_limit_is_inside():
+    robot = load_robot(HEAVY)
+    assert load_robot(changed(HEAVY, base=tuple(robot.position_upper))).base[0] == robot.position_upper[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            'name="joint_3" type="revolute"',
+            'name="joint_3" type="continuous"',
+            "'joint_3' is a joint of type JointModelRU",
+        ),
+        (
+            'name="joint_3" type="revolute"',
+            'name="joint_3" type="floating"',
+            "'joint_3' is a joint of type JointModelFree",
+        ),
+        ('<parent link="link_6"/>', '<parent link="link_4"/>', "'joint_7' is not moved by 'joint_6'"),
+        ('effort="110"', 'effort="0"', "joint_5: the torque limit must be positive and finite, got 0"),
+        ('velocity="1.3089969389957472"', 'velocity="0"', "joint_4: the velocity limit must be positive"),
+    ],
+    ids=["continuous", "floating", "branching", "no torque", "no velocity"],
+)
+def test_robots_that_cannot_be_planned_are_refused(tmp_path, old, new, expected):
+    assert expected in mistake_of(with_urdf(tmp_path, old, new))
+
+
+def test_continuous_joint_that_is_locked_is_no_obstacle(tmp_path):
+    problem = with_urdf(tmp_path, 'name="joint_7" type="revolute"', 'name="joint_7" type="continuous"')
+    assert load_robot(changed(problem, joints=HEAVY.robot.joints[:6], base=(0.0,) * 6)).n == 6
+
+
+@pytest.mark.parametrize("text", ["", "<robot>", "not xml at all"])
+def test_file_that_is_no_urdf_is_named(tmp_path, text):
+    (tmp_path / "broken.urdf").write_text(text)
+    problem = changed(replace(HEAVY, path=tmp_path / "problem.toml"), urdf="broken.urdf")
+    assert f"{tmp_path / 'broken.urdf'}: not a URDF that Pinocchio can read" in mistake_of(problem)
+
+
+def test_missing_urdf_is_named():
+    assert "absent.urdf: not a URDF that Pinocchio can read" in mistake_of(changed(HEAVY, urdf="absent.urdf"))
