@@ -54,7 +54,9 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
 def describe_pipeline(pipeline: Pipeline) -> str:
     """Describe the stages of a pipeline, numbered."""
     steps = [(f"{number}.", kind_name(stage), stage.describe()) for number, stage in enumerate(pipeline.stage, 1)]
-    steps.append(("", "(always)", "reject what does not meet every constraint exactly, on the numbers as they are stored"))
+    steps.append(
+        ("", "(always)", "reject what does not meet every constraint exactly, on the numbers as they are stored")
+    )
     return "\n".join([f"pipeline {pipeline.name}", *_title(pipeline.title), *table(steps, indent="  ")])
 
 
@@ -86,7 +88,10 @@ def _limit_rows(robot: Robot) -> list[tuple[str, ...]]:
     columns = (robot.velocity_limit, robot.acceleration_limit, robot.torque_limit, robot.base)
     ranges = zip(robot.position_lower, robot.position_upper, strict=True)
     rows = zip(robot.joint_names, ranges, *columns, strict=True)
-    return [head, *((name, f"{low:.4g} to {high:.4g}", *(f"{x:.4g}" for x in rest)) for name, (low, high), *rest in rows)]
+    return [
+        head,
+        *((name, f"{low:.4g} to {high:.4g}", *(f"{x:.4g}" for x in rest)) for name, (low, high), *rest in rows),
+    ]
 
 
 def _title(title: str) -> list[str]:
@@ -145,8 +150,8 @@ def describe_kind(group: str, name: str) -> str:
         RecipeError: There is no such kind.
     """
     kind = plugins.load(group, name)
-    head = ("key", "default", "value", "meaning")
-    rows = [(key.name, _default(key), _expected(key), key.doc) for key in keys(kind)]
+    head = ("key", "default", "meaning (value)")
+    rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
     noun = plugins.BASES[group].__name__.lower()
     text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
     return "\n".join([f"{noun} {name}", *_title(kind_summary(kind)), "", *text])

@@ -334,3 +334,25 @@ def test_what_is_no_number_is_an_infinite_violation():
 def test_slack_of_limits_is_relative_to_them_and_of_the_rest_absolute():
     np.testing.assert_allclose(condition([0.0, 0.0], [-300.0, -0.5], [100.0, np.inf]).slack("float64"), [3e-10, 1e-12])
     np.testing.assert_array_equal(condition([0.0], [-300.0], [300.0], "velocity").slack("float32"), [1e-5])
+
+
+# --- what a motion may do that a boundary state may not
+# ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(KINDS))
+def test_tolerance_of_a_motion_is_absolute_or_a_fraction_of_the_limit(benches, name):
+    kind = KINDS[name]
+    for condition in kind.measured(benches["heavy-object"].state(0.1)):
+        fraction = name in {"joint-velocity", "joint-acceleration", "joint-torque"}
+        expected = kind.tolerance * condition.upper if fraction else np.full(len(condition.g), kind.tolerance)
+        np.testing.assert_array_equal(kind.allowed(condition), expected)
+
+
+def test_funnel_lets_a_motion_down_to_the_table_and_nothing_else_in(benches):
+    s, start = np.array([0.0, 0.1, 0.2, 0.3, 1.0]), np.array([0.8, 0.1, 0.157])
+    rectangle, height = KINDS["table"].measured(benches["airhockey"].state(benches["airhockey"].robot.base))
+    np.testing.assert_allclose(KINDS["table"].funnel(height, s, start), [0.003, 0.003, 0.0015, 0.0, 0.0], atol=1e-15)
+    for name, kind in KINDS.items():
+        for condition in kind.measured(benches["heavy-object"].state(0.1)) if name != "table" else (rectangle,):
+            np.testing.assert_array_equal(kind.funnel(condition, s, start), np.zeros(5))

@@ -9,7 +9,7 @@ import h5py
 import pytest
 from test_store_example import PLAN, dataset, make_shard, make_shards
 
-from cnpgen.store.check import Finding, check_dataset
+from cnpgen.store.check import Finding, check_content, check_dataset
 from cnpgen.store.documents import save_document
 from cnpgen.store.manifest import finalize, load_manifest
 from cnpgen.store.plan import save_plan, shards
@@ -66,13 +66,24 @@ def test_missing_files_are_found_and_named(dataset: Path, name: str) -> None:
     assert "missing" in found[name]
 
 
+def test_a_byte_that_makes_hdf5_hang_is_found(dataset: Path) -> None:
+    """HDF5 2.0 reads texts of a broken heap forever."""
+    content = (dataset / TASK.file).read_bytes()
+    for position in range(content.index(b"GCOL"), len(content), 401):
+        (dataset / TASK.file).write_bytes(content[:position] + b"\xff" + content[position + 1 :])
+        if content[position] != 0xFF:
+            assert problems(dataset).keys() == {TASK.file}
+
+
 def test_a_shard_from_another_seed_is_named_as_such(tmp_path: Path, dataset: Path) -> None:
     other = tmp_path / "other"
     make_shards(other, replace(PLAN, seed=5))
-    for name in (TASK.file, TASK.sidecar):
-        shutil.copy(other / name, dataset / name)
+    shutil.copy(other / TASK.file, dataset / TASK.file)
+    message = f"{TASK.file}: its root_seed is '5', the plan says '{PLAN.seed}'"
+    assert message in [str(item) for item in check_dataset(dataset)]
+    shutil.copy(other / TASK.sidecar, dataset / TASK.sidecar)
     texts = [str(item) for item in check_dataset(dataset)]
-    assert any(text.startswith(f"{TASK.file}: its root_seed is '5', the plan says") for text in texts)
+    assert message in texts
     assert any(text.startswith(f"{TASK.sidecar}: belongs to another plan") for text in texts)
     assert {item.file for item in check_dataset(dataset)} == {TASK.file, TASK.sidecar}
 
@@ -82,7 +93,8 @@ def test_swapped_shards_are_found(dataset: Path) -> None:
     content = first.read_bytes()
     shutil.copy(last, first)
     last.write_bytes(content)
-    texts = [str(item) for item in check_dataset(dataset)]
+    assert problems(dataset).keys() == {TASK.file, shards(PLAN)[-1].file}
+    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
     assert any("its split is 'validation', the plan says 'train'" in text for text in texts)
 
 
@@ -102,7 +114,8 @@ def test_shards_that_contradict_the_plan_are_found(
 ) -> None:
     with h5py.File(dataset / TASK.file, "r+") as file:
         change(file)
-    texts = [str(item) for item in check_dataset(dataset)]
+    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    assert problems(dataset).keys() == {TASK.file}
     assert any(message in text for text in texts)
 
 
@@ -111,7 +124,8 @@ def test_a_shard_with_other_rows_or_types_is_found(dataset: Path) -> None:
         attributes = dict(file["clearance"].attrs)
         del file["clearance"]
         file.create_dataset("clearance", data=[0.0] * 31, dtype="<f4").attrs.update(attributes)
-    assert any("'clearance' is float32 of shape (31,), not float64" in str(item) for item in check_dataset(dataset))
+    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    assert any("'clearance' is float32 of shape (31,), not float64" in text for text in texts)
 
 
 def test_files_that_do_not_belong_to_the_dataset_are_notes(dataset: Path) -> None:

@@ -118,14 +118,14 @@ def test_a_missing_file_is_a_dataset_error_and_an_unreadable_one_a_machine_error
         read(tmp_path)
 
 
-def test_sweeping_removes_temporary_files_and_keeps_others(tmp_path: Path) -> None:
+def test_sweeping_removes_old_temporary_files_and_keeps_others(tmp_path: Path) -> None:
     work = tmp_path / "_work"
     sweep(work)
     work.mkdir()
-    (work / ".a.1.2.tmp").write_text("")
+    for name in (".old.1.2.tmp", ".new.1.2.tmp", "log.txt"):
+        (work / name).write_text("")
+    os.utime(work / ".old.1.2.tmp", (0, 0))
     sweep(work)
-    assert not work.exists()
-    work.mkdir()
-    (work / "log.txt").write_text("")
-    sweep(work)
-    assert (work / "log.txt").exists()
+    assert sorted(path.name for path in work.iterdir()) == [".new.1.2.tmp", "log.txt"]
+    sweep(work, older_than=0.0)
+    assert [path.name for path in work.iterdir()] == ["log.txt"]

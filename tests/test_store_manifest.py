@@ -4,19 +4,22 @@ import contextlib
 import hashlib
 import io
 import json
+import multiprocessing
 import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_store_example import FIELDS, PLAN, dataset, make_columns, make_shard, make_shards
+from test_store_example import FIELDS, PLAN, dataset, make_columns, make_outcome, make_shard, make_shards
 
-from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store import manifest as manifest_module
+from cnpgen.store.check import check_dataset
 from cnpgen.store.files import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
 from cnpgen.store.plan import save_plan, shards
+from cnpgen.store.record import commit_shard
 
 __all__ = ["dataset"]
 
@@ -69,6 +72,34 @@ def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
     assert stats["densities"]["train"]["goal"]["drawn"] == [[4] * 3] * 4
 
 
+def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
+    before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
+    finalize(dataset, notes="Some notes.", citation="A. Author, 2026")
+    assert {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()} == before
+    assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
+
+
+def test_finishing_in_several_processes_at_once_gives_a_good_dataset(dataset: Path) -> None:
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        manifests = pool.map(finalize, [dataset] * 9)
+    assert check_dataset(dataset) == []
+    assert manifests == [load_manifest(dataset)] * 9
+
+
+def test_records_without_a_start_are_dated_by_the_clock_and_nonsense_is_refused(tmp_path: Path) -> None:
+    plan = replace(PLAN, splits={"train": 10})
+    task = shards(plan)[0]
+    for started, good in (("", True), ("yesterday", False)):
+        folder = tmp_path / str(good)
+        save_plan(folder, plan)
+        commit_shard(folder, plan, task, columns=make_columns(task), outcome=make_outcome(task), started=started)
+        if good:
+            assert finalize(folder)["created"].endswith("Z")
+        else:
+            with pytest.raises(DatasetError, match="yesterday"):
+                finalize(folder)
+
+
 def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1763690000")
     assert finalize(dataset)["created"] == "2025-11-21T01:53:20Z"
@@ -76,7 +107,7 @@ def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch:
     finalize(dataset)
     assert (dataset / "manifest.json").read_bytes() == first
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
-    with pytest.raises(UsageError, match="yesterday"):
+    with pytest.raises(DatasetError, match="SOURCE_DATE_EPOCH is 'yesterday'"):
         finalize(dataset)
 
 

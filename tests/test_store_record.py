@@ -41,7 +41,16 @@ def test_a_committed_shard_has_a_record_that_describes_it(tmp_path: Path) -> Non
 
 def test_making_a_shard_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     first = make_shard(tmp_path, PLAN, TASK)
+    (tmp_path / TASK.sidecar).unlink()
     assert make_shard(tmp_path, PLAN, TASK).sha256 == first.sha256
+
+
+def test_a_committed_shard_and_its_sidecar_are_not_written_again(tmp_path: Path) -> None:
+    make_shard(tmp_path, PLAN, TASK)
+    before = [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)]
+    record = commit_shard(tmp_path, PLAN, TASK, columns=make_columns(TASK), outcome=make_outcome(TASK), seconds=9.0)
+    assert record.seconds == 0.5
+    assert [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)] == before
 
 
 def test_the_shard_is_there_before_its_sidecar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

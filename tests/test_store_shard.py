@@ -47,6 +47,7 @@ def test_attributes_say_what_the_file_and_its_numbers_are(tmp_path: Path) -> Non
     path = tmp_path / "a.h5"
     write(path)
     assert read_attributes(path) == {"format": "cnpgen-shard", "format_version": 1, **ATTRIBUTES}
+    assert read_attributes(path, ["rows", "split"]) == {"rows": 32, "split": "train"}
     schema = read_schema(path)
     start, goal = schema["start_q"].attributes, schema["goal_p"].attributes
     assert schema["start_q"].shape == (32, 3)

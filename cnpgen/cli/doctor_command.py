@@ -1,3 +1,60 @@
-"""x."""
-from cnpgen.cli.parser import *
-def add(commands): pass
+"""``cnpgen doctor``: whether this machine has what cnpgen needs."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.errors import MachineError
+
+if TYPE_CHECKING:
+    from cnpgen.doctor import MachineReport
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    title = "check that this machine has what cnpgen needs"
+    add_json(add_command(commands, "doctor", run, title=title))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    import json
+
+    from cnpgen.doctor import check_machine
+
+    report = check_machine()
+    print(json.dumps(report.to_dict(), indent=2) if arguments.json else machine_text(report))
+    for note in report.notes:
+        print(f"cnpgen: warning: {note}", file=sys.stderr)
+    for problem in report.problems:
+        print(f"cnpgen: error: {problem}", file=sys.stderr)
+    return 0 if report.ok else MachineError.exit_code
+
+
+def machine_text(report: "MachineReport") -> str:
+    """Lay out a report for people."""
+    libraries = ", ".join(f"{name} {version}" for name, version in report.libraries.items())
+    settings = ", ".join(f"{name}={value}" for name, value in report.environment.items())
+    facts = {
+        "cnpgen": report.cnpgen,
+        "python": f"{report.python}, {report.executable}",
+        "platform": report.platform,
+        "cores": f"{report.cores} available of {report.cores_present}, vector instructions: {report.vector}",
+        "libraries": libraries,
+        "HDF5": report.hdf5,
+        "variables": settings or "none that matter is set",
+        "compiler": report.compiler or "none",
+        "backend": f"{report.backend or 'none'}: {report.backend_reason}",
+        "cache": f"{report.cache_folder} ({'writable' if report.cache_writable else 'not writable'})",
+        "recipes": report.recipes,
+        "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
+        "verdict": "everything that cnpgen needs works" if report.ok else f"{len(report.problems)} problems",
+    }
+    return "\n".join(f"{name:<10} {_folded(value)}" for name, value in facts.items())
+
+
+def _folded(text: str) -> str:
+    import textwrap
+
+    return ("\n" + " " * 11).join(textwrap.wrap(text, 89, break_long_words=False, break_on_hyphens=False))

@@ -1,3 +1,100 @@
-"""x."""
-from cnpgen.cli.parser import *
-def add(commands): pass
+"""``cnpgen inspect``: what a dataset holds and how it came about."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+
+if TYPE_CHECKING:
+    from cnpgen.fields import Field
+    from cnpgen.inspection import Inspection
+    from cnpgen.store.outcome import Outcome
+    from cnpgen.store.statistics import FieldStatistics
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "inspect", run, title="show what a dataset holds and how it came about")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="folder of a dataset, finished or not")
+    parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="draw it, too: .png, .pdf or .svg")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.inspection import inspect_dataset
+    from cnpgen.store.documents import render
+
+    found = inspect_dataset(arguments.folder)
+    print(render(found.to_dict()) if arguments.json else inspection_text(found))
+    if arguments.plot:
+        from cnpgen.plots import plot_dataset
+
+        plot_dataset(found, arguments.plot)
+        print(f"drawn: {arguments.plot}", file=sys.stderr)
+    return 0
+
+
+def inspection_text(found: "Inspection") -> str:
+    """Lay out an inspection for people."""
+    from cnpgen.describe import table
+
+    plan = found.plan
+    sections = [[f"{plan.name} {plan.version}  {plan.title}".rstrip(), *table(_facts(found), indent="  ")]]
+    if found.outcome.tried:
+        sections.append(_yield_lines(found.outcome))
+    head = ("field", "column", "unit", "min", "mean", "max")
+    rows = [row for field in plan.fields for row in _field_rows(field, found.statistics.get(field.name))]
+    sections.append(table([(*row, "") for row in (head, *rows)], indent="  ", right=(3, 4, 5)))
+    return "\n\n".join("\n".join(lines) for lines in sections)
+
+
+def _facts(found: "Inspection") -> list[tuple[str, str]]:
+    from cnpgen.cli.plan_text import size_text
+
+    plan = found.plan
+    splits = [
+        f"{split} {n:,}" + ("" if n == plan.splits[split] else f" of {plan.splits[split]:,}")
+        for split, n in found.rows.items()
+    ]
+    versions = [", ".join(f"{name} {version}" for name, version in made.items()) for made in found.environments]
+    return [
+        ("state", found.state),
+        ("rows", f"{sum(found.rows.values()):,}: {', '.join(splits)}"),
+        ("shards", f"{len(found.summary.records)} of at most {plan.shard_size:,} rows"),
+        ("size", f"{size_text(found.bytes)}, {plan.dtype}"),
+        ("seed", str(plan.seed)),
+        ("backend", f"{plan.backend}, {found.seconds:,.1f} s of work"),
+        ("recipe", f"sha256 {plan.recipe_sha256}"),
+        *(("made with", text) for text in versions),
+    ]
+
+
+def _yield_lines(outcome: "Outcome") -> list[str]:
+    """Lay out the fates of the draws, in pipeline order."""
+    from cnpgen.describe import table
+
+    rows = [("rejected because", "draws", "of all", "left"), ("", f"{outcome.tried:,}", "", "100.00 %")]
+    left = outcome.tried
+    for reason, count in outcome.rejections.items():
+        left -= count
+        rows.append(
+            (reason, f"{count:,}", f"{100 * count / outcome.tried:.2f} %", f"{100 * left / outcome.tried:.2f} %")
+        )
+    share = f"{100 * outcome.accepted / outcome.tried:.2f} %"
+    lines = table([(*row, "") for row in rows], indent="  ", right=(1, 2, 3))
+    return [f"  {outcome.accepted:,} of {outcome.tried:,} draws accepted, {share}", *lines]
+
+
+def _field_rows(field: "Field", found: "FieldStatistics | None") -> list[tuple[str, ...]]:
+    """Return a row per column of a field; the field's name and unit are on the first one."""
+    columns = field.names or ("",) * max(field.width, 1)
+    rows = []
+    for index, column in enumerate(columns):
+        first = (field.name, column, field.unit) if index == 0 else ("", column, "")
+        numbers = (found.minimum, found.mean, found.maximum) if found else ()
+        rows.append((*first, *(f"{values[index]:.5g}" for values in numbers), *([] if found else ["-"] * 3)))
+    return rows

@@ -38,41 +38,48 @@ def list_all(what: str) -> list[dict[str, Any]]:
     Args:
         what: One of ``WHAT``.
     """
-    from cnpgen import library, plugins
+    from cnpgen import plugins
 
-    noun = what.removesuffix("s")
-    if noun == "stage" or noun == "constraint":
-        group = plugins.STAGES if noun == "stage" else plugins.CONSTRAINTS
-        return [{"name": name, "title": _summary(group, name)} for name in plugins.names(group)]
-    entries = {"dataset": _dataset, "pipeline": _pipeline, "problem": _problem}
-    kinds: dict[str, library.Kind] = {"dataset": "dataset", "pipeline": "pipeline", "problem": "problem"}
-    return [entries[noun](name) | {"file": file} for name, file in library.list_recipes(kinds[noun]).items()]
+    groups = {"stages": plugins.STAGES, "constraints": plugins.CONSTRAINTS}
+    if what in groups:
+        return [{"name": name, "title": _summary(groups[what], name)} for name in plugins.names(groups[what])]
+    return {"datasets": _datasets, "pipelines": _pipelines, "problems": _problems}[what]()
 
 
-def _dataset(name: str) -> dict[str, Any]:
-    from cnpgen.library import load_dataset_recipe
+def _datasets() -> list[dict[str, Any]]:
+    from cnpgen.library import list_recipes, load_dataset_recipe
 
-    recipe = load_dataset_recipe(name)
-    rows = sum(recipe.splits.values())
-    size = {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
-    return {"name": name, "title": recipe.title, "version": recipe.version, "pipeline": recipe.pipeline.name, **size}
-
-
-def _pipeline(name: str) -> dict[str, Any]:
-    from cnpgen.library import load_pipeline
-
-    recipe = load_pipeline(name)
-    stages = len(recipe.stage)
-    return {"name": name, "title": recipe.title, "problem": recipe.problem.name, "size": f"{stages} stages", "stages": stages}
+    entries = []
+    for name, file in list_recipes("dataset").items():
+        recipe = load_dataset_recipe(name)
+        rows = sum(recipe.splits.values())
+        size = {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
+        about = {"version": recipe.version, "pipeline": recipe.pipeline.name}
+        entries.append({"name": name, "title": recipe.title, **about, **size, "file": file})
+    return entries
 
 
-def _problem(name: str) -> dict[str, Any]:
-    from cnpgen.library import load_problem
+def _pipelines() -> list[dict[str, Any]]:
+    from cnpgen.library import list_recipes, load_pipeline
 
-    recipe = load_problem(name)
-    joints, constraints = len(recipe.robot.joints), len(recipe.constraint)
-    size = f"{joints} joints, {constraints} constraints"
-    return {"name": name, "title": recipe.title, "size": size, "joints": joints, "constraints": constraints}
+    entries = []
+    for name, file in list_recipes("pipeline").items():
+        recipe = load_pipeline(name)
+        size = {"size": f"{len(recipe.stage)} stages", "stages": len(recipe.stage)}
+        entries.append({"name": name, "title": recipe.title, "problem": recipe.problem.name, **size, "file": file})
+    return entries
+
+
+def _problems() -> list[dict[str, Any]]:
+    from cnpgen.library import list_recipes, load_problem
+
+    entries = []
+    for name, file in list_recipes("problem").items():
+        recipe = load_problem(name)
+        count = {"joints": len(recipe.robot.joints), "constraints": len(recipe.constraint)}
+        size = ", ".join(f"{number} {what}" for what, number in count.items())
+        entries.append({"name": name, "title": recipe.title, "size": size, **count, "file": file})
+    return entries
 
 
 def _summary(group: str, name: str) -> str:

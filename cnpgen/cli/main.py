@@ -134,7 +134,9 @@ def _explain(error: BaseException) -> tuple[Sequence[str], int]:
     if isinstance(error, OSError) and error.strerror:
         return [f"{error.filename or 'the system'}: {error.strerror}"], code
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    return [f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"], code
+    return [
+        f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"
+    ], code
 
 
 def _leave_pipe() -> int:

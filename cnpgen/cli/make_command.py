@@ -36,7 +36,9 @@ def add(commands: "Commands[Parser]") -> None:
     option("--shard-size", metavar="R", type=values.positive, help="rows per file, a multiple of 4096")
     option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
     option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")
-    option("--part", metavar="K/M", type=values.part, help="make the K-th of M parts only (0/M to M-1/M), for job arrays")
+    option(
+        "--part", metavar="K/M", type=values.part, help="make the K-th of M parts only (0/M to M-1/M), for job arrays"
+    )
     option("--force", action="store_true", help="replace another dataset that is in the folder")
     option("--dry-run", action="store_true", help="print what would be made, and write nothing")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -71,7 +73,7 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
     folder = arguments.out or default_folder(recipe)
     tasks, there = _scope(recipe, folder, arguments)
     initial = sum(task.rows for task in there)
-    meter = Meter(str(folder), sum(task.rows for task in tasks), initial, quiet=arguments.quiet)
+    meter = Meter(f"making {folder}", sum(task.rows for task in tasks), initial, quiet=arguments.quiet)
     try:
         made = make_dataset(
             recipe,
@@ -119,9 +121,7 @@ def _scope(
     return mine, [task for task in mine if begun and is_committed(folder, task, begun.fingerprint)]
 
 
-def _begun(
-    recipe: "DatasetRecipe", folder: Path, total: int, arguments: argparse.Namespace
-) -> "DatasetPlan | None":
+def _begun(recipe: "DatasetRecipe", folder: Path, total: int, arguments: argparse.Namespace) -> "DatasetPlan | None":
     """Return the plan in the folder if it is, as far as can be told without building kernels, the one to go on with."""
     from cnpgen.recipes import recipe_digest, split_rows
     from cnpgen.store.layout import PLAN
@@ -136,15 +136,19 @@ def _begun(
 
 
 def _summary(made: "MadeDataset", meter: Meter) -> list[str]:
-    """Say in a line or two what was done."""
+    """Say in a few lines what was done."""
+    import textwrap
+
     splits = ", ".join(f"{split} {rows:,}" for split, rows in made.plan.splits.items())
-    total = f"{sum(made.plan.splits.values()):,} rows ({splits})"
-    if made.complete and not made.made:
-        return [f"already complete: {total}"]
-    seconds = meter.seconds
-    speed = f"{made.made:,} rows made in {seconds:.1f} s, {made.made / max(seconds, 1e-9):,.0f} rows/s"
-    lines = [f"complete: {total}; {speed}" if made.complete else f"{speed}; other parts of {total} are still to be made"]
-    return [*lines, *([_yield(meter.outcome)] if meter.outcome else [])]
+    rows = sum(made.plan.splits.values())
+    total = f"{rows:,} rows ({splits})"
+    rest = "" if made.complete else "; other parts are still to be made"
+    if not made.made:
+        return [f"already {'complete' if made.complete else 'made, this part of'}: {total}{rest}"]
+    share = "" if made.made == rows else f"the last {made.made:,} of " if made.complete else f"{made.made:,} of "
+    speed = f"in {meter.seconds:.1f} s, {made.made / max(meter.seconds, 1e-9):,.0f} rows/s"
+    lines = [f"made {share}{total} {speed}{rest}", *([_yield(meter.outcome)] if meter.outcome else [])]
+    return [part for line in lines for part in textwrap.wrap(line, 100, subsequent_indent="  ")]
 
 
 def _yield(outcome: "Outcome") -> str:
@@ -153,4 +157,4 @@ def _yield(outcome: "Outcome") -> str:
     worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]
     reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count)
     text = f"accepted {outcome.accepted / tried:.1%} of {outcome.tried:,} draws"
-    return f"{text}; most of the others: {reasons}" if reasons else text
+    return f"{text}; rejected: {reasons}" if reasons else text

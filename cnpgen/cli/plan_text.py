@@ -45,7 +45,9 @@ def plan_text(recipe: "DatasetRecipe", *, force: bool, **settings: Any) -> str:
     ]
     fields = [("field", "columns", "unit", "what")]
     fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in plan.fields]
-    return "\n".join([f"{plan.name} {plan.version}", *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))])
+    return "\n".join(
+        [f"{plan.name} {plan.version}", *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))]
+    )
 
 
 def row_bytes(plan: DatasetPlan) -> int:

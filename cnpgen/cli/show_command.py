@@ -20,7 +20,9 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "show", run, title="describe a recipe, or a kind of stage or constraint")
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help="a shipped dataset, pipeline or problem, or a file")
+    what.add_argument(
+        "recipe", metavar="NAME|FILE", nargs="?", help="a shipped dataset, pipeline or problem, or a file"
+    )
     what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
     what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
     parser.add_argument("--kind", choices=KINDS, help="which one, where several recipes have the same name")
@@ -33,10 +35,14 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.store.documents import plain, render
 
     if arguments.recipe is None:
-        group, name = (plugins.STAGES, arguments.stage) if arguments.stage else (plugins.CONSTRAINTS, arguments.constraint)
+        group, name = (
+            (plugins.STAGES, arguments.stage) if arguments.stage else (plugins.CONSTRAINTS, arguments.constraint)
+        )
         if arguments.kind:
             raise UsageError("--kind says which recipe is meant: it goes with NAME or FILE only")
-        print(render(plain(describe.kind_to_dict(group, name))) if arguments.json else describe.describe_kind(group, name))
+        print(
+            render(plain(describe.kind_to_dict(group, name))) if arguments.json else describe.describe_kind(group, name)
+        )
         return 0
     recipe = load_any(arguments.recipe, arguments.kind)
     print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
@@ -51,8 +57,10 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
     """
     from cnpgen import library
 
-    load = {"dataset": library.load_dataset_recipe, "pipeline": library.load_pipeline, "problem": library.load_problem}
-    return load[kind or _kind(name_or_path)](name_or_path)
+    kind = kind or _kind(name_or_path)
+    if kind == "dataset":
+        return library.load_dataset_recipe(name_or_path)
+    return library.load_pipeline(name_or_path) if kind == "pipeline" else library.load_problem(name_or_path)
 
 
 def _kind(name_or_path: str) -> "Kind":
@@ -72,7 +80,7 @@ def _kind(name_or_path: str) -> "Kind":
 
 
 def _kind_of_file(path: Path) -> "Kind":
-    """Tell the kind of a recipe file by its keys; a file that cannot be read is left to the loader to complain about."""
+    """Tell the kind of a recipe file by its keys; of a file that cannot be read the loader says what is wrong."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):

@@ -1,3 +1,70 @@
-"""x."""
-from cnpgen.cli.parser import *
-def add(commands): pass
+"""``cnpgen validate``: prove that a dataset is what it says it is."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.progress import Meter
+
+if TYPE_CHECKING:
+    from cnpgen.validation import ValidationReport
+
+_TEXT = """\
+Always checked: that every file is there, whole and what the plan and the manifest say. Findings are on stdout, one per
+line, as FILE: PROBLEM; the exit code is 1 if there are any.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "validate", run, title="prove that a dataset is what it says it is", text=_TEXT)
+    option = parser.add_argument
+    option("folder", metavar="DIR", type=Path, help="folder of a dataset")
+    option("--deep", action="store_true", help="compute every row's constraints again with Pinocchio and Coal")
+    option("--regenerate", metavar="K", type=values.natural, default=0, help="make K random blocks again and compare")
+    option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.store.documents import plain, render
+
+    report = _validate(arguments)
+    if arguments.json:
+        print(render(plain(report.to_dict())))
+    else:
+        for finding in report.findings:
+            print(f"{finding.file}: {' '.join(finding.problem.split())}")
+        print(report.summary(), file=sys.stderr)
+    return 0 if report.ok else 1
+
+
+def _validate(arguments: argparse.Namespace) -> "ValidationReport":
+    from cnpgen.validation import validate_dataset
+
+    options = {"deep": arguments.deep, "regenerate": arguments.regenerate, "workers": arguments.workers}
+    rows = _rows(arguments.folder) if arguments.deep else 0
+    if not rows:
+        return validate_dataset(arguments.folder, **options)
+    meter = Meter(f"validating {arguments.folder}", rows)
+    try:
+        return validate_dataset(arguments.folder, **options, progress=meter)
+    finally:
+        meter.close()
+
+
+def _rows(folder: Path) -> int:
+    """Return how many rows there are to compute again; 0 if the plan cannot say, which validation will report."""
+    from cnpgen.errors import DatasetError
+    from cnpgen.store.plan import load_plan, shards
+    from cnpgen.store.record import is_committed
+
+    try:
+        plan = load_plan(folder)
+    except DatasetError:
+        return 0
+    return sum(task.rows for task in shards(plan) if is_committed(folder, task, plan.fingerprint))

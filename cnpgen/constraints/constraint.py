@@ -78,6 +78,25 @@ class Constraint(ABC):
     tolerance: float
     budget: float = field("acceptable violation while training (the paper's C-bar^2)", low=0.0, default=0.0)
 
+    def allowed(self, condition: Condition) -> NDArray[np.float64]:
+        """Return how far a motion may be outside a condition and still be called valid, in its unit, shape (m,)."""
+        return np.full(len(condition.g), self.tolerance)
+
+    def funnel(
+        self, condition: Condition, s: NDArray[np.float64], start_tip: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return how much wider than its bounds a condition is at phases s of a motion, in its unit, shape (K,).
+
+        By default nothing; a constraint that motions may begin outside of lets them in here.
+
+        Args:
+            condition: One of the conditions of ``measured``.
+            s: Phases, shape (K,).
+            start_tip: Position of the tip at the start [m], shape (3,).
+        """
+        del condition, start_tip
+        return np.zeros(len(s))
+
     @abstractmethod
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the condition on a motion as SX expressions of the symbolic state."""

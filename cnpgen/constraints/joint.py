@@ -1,4 +1,7 @@
-"""Joint limits: position, velocity, acceleration and torque, each within the planning limits of the robot."""
+"""Joint limits: position, velocity, acceleration and torque, each within the planning limits of the robot.
+
+Tolerances of velocity, acceleration and torque are fractions of the limit.
+"""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,6 +15,19 @@ from cnpgen.schema import field
 if TYPE_CHECKING:
     from cnpgen.robots.symbolic import SymbolicState
     from cnpgen.verify.world import World
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RelativeLimit(Constraint):
+    """A symmetric limit whose tolerance is a fraction of it."""
+
+    tolerance: float = field(
+        "how far beyond the limit a motion may be and still be called valid, as a fraction", low=0.0
+    )
+
+    def allowed(self, condition: Condition) -> NDArray[np.float64]:
+        """Return the fraction of the limit, shape (m,)."""
+        return self.tolerance * condition.upper
 
 
 def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64], needs: int) -> tuple[Condition, ...]:
@@ -37,11 +53,10 @@ class JointPosition(Constraint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointVelocity(Constraint):
+class JointVelocity(_RelativeLimit):
     """``|dq| <= velocity limit``."""
 
     reason = "joint velocity limit"
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="rad/s", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on dq [rad/s]."""
@@ -53,11 +68,10 @@ class JointVelocity(Constraint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointAcceleration(Constraint):
+class JointAcceleration(_RelativeLimit):
     """``|ddq| <= acceleration limit``."""
 
     reason = "joint acceleration limit"
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="rad/s^2", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on ddq [rad/s^2]."""
@@ -69,11 +83,10 @@ class JointAcceleration(Constraint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointTorque(Constraint):
+class JointTorque(_RelativeLimit):
     """``|ID(q, dq, ddq)| <= torque limit``, payload included."""
 
     reason = "joint torque limit"
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="N m", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on the inverse dynamics [N m]."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema import Range, field
@@ -11,6 +12,8 @@ from cnpgen.schema import Range, field
 if TYPE_CHECKING:
     from cnpgen.robots.symbolic import SymbolicState
     from cnpgen.verify.world import World
+
+FUNNEL = (0.1, 0.3)  # phases between which a motion that starts off the table must come down to it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +42,15 @@ class Table(Constraint):
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate position, vertical velocity and vertical acceleration with Pinocchio."""
         return self._boundary(list(world.tip_position), world.tip_velocity[2], world.tip_acceleration[2], end)
+
+    def funnel(
+        self, condition: Condition, s: NDArray[np.float64], start_tip: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Let a motion that starts off the table reach it: all of its height until s = 0.1, nothing from s = 0.3 on."""
+        if condition.name != "table height":
+            return np.zeros(len(s))
+        open_: NDArray[np.float64] = np.clip((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0, 1.0)
+        return abs(float(start_tip[2]) - self.z) * open_
 
     def _position(self, tip: list[Any], band: float) -> tuple[Condition, ...]:
         low, high = np.array([self.x.low, self.y.low]), np.array([self.x.high, self.y.high])

@@ -93,16 +93,25 @@ def _emitter_digest() -> str:
     return hashlib.sha256(source + PRELUDE.encode()).hexdigest()
 
 
-def library_path(tape: Tape, cache_folder: Path, compiler: str) -> Path:
-    """Where the library of a tape is cached: named by everything that determines its content."""
+def library_stem(tape: Tape, compiler: str) -> str:
+    """How the file name of a tape's library begins: with everything that determines its content."""
     identity = hashlib.sha256(tape.to_bytes())
     for text in (*FLAGS, *vector_flags(), compiler_version(compiler), target(), _emitter_digest()):
         identity.update(text.encode() + b"\0")
-    return cache_folder / "lib" / f"{tape.name}-{identity.hexdigest()[:24]}.so"
+    return f"{tape.name}-{identity.hexdigest()[:24]}"
+
+
+def find_library(folder: Path, stem: str) -> Path | None:
+    """Return a library whose content is what its file name says, or None; loading a damaged one would be fatal."""
+    return next((path for path in folder.glob(f"{stem}-*.so") if path.stem == f"{stem}-{_content_digest(path)}"), None)
+
+
+def _content_digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:24]
 
 
 def compile_tape(tape: Tape, cache_folder: Path) -> Path:
-    """Return the library of a tape, compiling it if it is not in the cache.
+    """Return the library of a tape, compiling it if it is not in the cache or damaged there.
 
     Raises:
         MachineError: There is no working compiler or the cache folder cannot be written.
@@ -110,19 +119,18 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     compiler = find_compiler()
     if compiler is None:
         raise MachineError("no C compiler found (looked for $CC, cc, gcc, clang)")
-    path = library_path(tape, cache_folder, compiler)
-    if path.exists():
-        return path
+    libraries, stem = cache_folder / "lib", library_stem(tape, compiler)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
+        if found := find_library(libraries, stem):
+            return found
+        libraries.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
             source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"
             source.write_text(emit(tape), encoding="utf-8")
             _run_compiler(compiler, source, built)
-            built.replace(path)
+            return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
     except OSError as error:
-        raise MachineError(f"cannot write the kernel cache {path.parent}: {error.strerror or error}") from error
-    return path
+        raise MachineError(f"cannot use the kernel cache {libraries}: {error.strerror or error}") from error
 
 
 def _run_compiler(compiler: str, source: Path, built: Path) -> None:

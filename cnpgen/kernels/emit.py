@@ -16,9 +16,10 @@ _BINARY = {
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
 
-# Vector types, comparisons (results are 1.0 or 0.0, as in CasADi) and sin/cos for |x| up to 2^20 (Cody and Waite's
-# reduction by pi/2 in three parts, then the minimax polynomials of the Cephes mathematical library: error below 1 ulp
-# there).
+# Vector types, comparisons (results are 1.0 or 0.0, as in CasADi), minima and maxima that ignore a nan (as C's fmin and
+# CasADi's do; the instructions return their second operand if either is nan) and sin/cos for |x| up to 2^20 (Cody and
+# Waite's reduction by pi/2 in three parts, then the minimax polynomials of the Cephes mathematical library: error below
+# 1 ulp there).
 PRELUDE = r"""
 #include <math.h>
 #include <string.h>
@@ -43,21 +44,23 @@ I v pick(vi m,v a,v b){return (v)((m&(vi)a)|(~m&(vi)b));}
 I v vabs(v x){return (v)((vi)x&0x7fffffffffffffffLL);}
 #if defined(__AVX512F__)
 I v vsqrt(v x){return (v)_mm512_sqrt_pd((__m512d)x);}
-I v vmin(v a,v b){return (v)_mm512_min_pd((__m512d)a,(__m512d)b);}
-I v vmax(v a,v b){return (v)_mm512_max_pd((__m512d)a,(__m512d)b);}
+I v lesser(v a,v b){return (v)_mm512_min_pd((__m512d)a,(__m512d)b);}
+I v larger(v a,v b){return (v)_mm512_max_pd((__m512d)a,(__m512d)b);}
 #elif defined(__AVX__)
 I v vsqrt(v x){return (v)_mm256_sqrt_pd((__m256d)x);}
-I v vmin(v a,v b){return (v)_mm256_min_pd((__m256d)a,(__m256d)b);}
-I v vmax(v a,v b){return (v)_mm256_max_pd((__m256d)a,(__m256d)b);}
+I v lesser(v a,v b){return (v)_mm256_min_pd((__m256d)a,(__m256d)b);}
+I v larger(v a,v b){return (v)_mm256_max_pd((__m256d)a,(__m256d)b);}
 #elif defined(__aarch64__)
 I v vsqrt(v x){return (v)vsqrtq_f64((float64x2_t)x);}
-I v vmin(v a,v b){return pick(a<b,a,b);}
-I v vmax(v a,v b){return pick(a>b,a,b);}
+I v lesser(v a,v b){return pick(a<b,a,b);}
+I v larger(v a,v b){return pick(a>b,a,b);}
 #else
 I v vsqrt(v x){for(int i=0;i<W;i++)x[i]=sqrt(x[i]);return x;}
-I v vmin(v a,v b){return pick(a<b,a,b);}
-I v vmax(v a,v b){return pick(a>b,a,b);}
+I v lesser(v a,v b){return pick(a<b,a,b);}
+I v larger(v a,v b){return pick(a>b,a,b);}
 #endif
+I v vmin(v a,v b){return pick(b!=b,a,lesser(a,b));}
+I v vmax(v a,v b){return pick(b!=b,a,larger(a,b));}
 I v flag(vi m){return (v)(m&(vi)K(1.0));}
 I v vlt(v a,v b){return flag(a<b);}
 I v vle(v a,v b){return flag(a<=b);}
@@ -67,7 +70,7 @@ I v vnot(v a){return flag(a==0.0);}
 I v vand(v a,v b){return flag((a!=0.0)&(b!=0.0));}
 I v vor(v a,v b){return flag((a!=0.0)|(b!=0.0));}
 I v vsel(v c,v b){return (v)((c!=0.0)&(vi)b);}
-I v vsign(v a){return vlt(K(0.0),a)-vlt(a,K(0.0));}
+I v vsign(v a){return pick(a!=a,a,vlt(K(0.0),a)-vlt(a,K(0.0)));}
 I v vexp(v x){for(int i=0;i<W;i++)x[i]=exp(x[i]);return x;}
 I void vsincos(v x,v*s,v*c){
   const double magic=6755399441055744.0;
@@ -159,7 +162,7 @@ def statements(tape: Tape, *, read: Callable[[int, int], str], write: Callable[[
     for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
         name = NAMES[code]
         if name == "CONST":
-            names[k] = f"K({constant!r})" if np.isfinite(constant) else f"K({'-' if constant < 0 else ''}INFINITY)"
+            names[k] = f"K({_literal(constant)})"
             continue
         if name == "OUTPUT":
             lines.append(write(b, int(constant), names[a]))
@@ -179,3 +182,10 @@ def statements(tape: Tape, *, read: Callable[[int, int], str], write: Callable[[
         names[k] = f"t{k}"
         lines.append(f"v t{k}={expression};")
     return "\n".join(lines)
+
+
+def _literal(constant: float) -> str:
+    """Write a number in C."""
+    if np.isnan(constant):
+        return "NAN"
+    return repr(constant) if np.isfinite(constant) else f"{'-' if constant < 0 else ''}INFINITY"

@@ -23,7 +23,7 @@ _APPLY: dict[str, Callable[..., Any]] = {
     "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "NEG": np.negative, "SQ": np.square,
     "TWICE": _twice, "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin,
     "COS": np.cos,
-    "EXP": np.exp, "FMIN": np.minimum, "FMAX": np.maximum, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
+    "EXP": np.exp, "FMIN": np.fmin, "FMAX": np.fmax, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
     "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or,
     "IF_ELSE_ZERO": _if_else_zero,
 }  # fmt: skip

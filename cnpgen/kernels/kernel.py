@@ -43,7 +43,11 @@ def check_arguments(tape: Tape, arguments: Sequence[Array]) -> int:
         raise ValueError(f"kernel {tape.name}: needs {len(tape.inputs)} arguments, got {len(arguments)}")
     n = int(arguments[0].shape[-1])
     for index, (argument, width) in enumerate(zip(arguments, tape.inputs, strict=True)):
-        if argument.shape != (width, n) or argument.dtype != np.float64 or (argument.size > 1 and n > 1 and argument.strides[1] != 8):
+        if (
+            argument.shape != (width, n)
+            or argument.dtype != np.float64
+            or (argument.size > 1 and n > 1 and argument.strides[1] != 8)
+        ):
             raise ValueError(
                 f"kernel {tape.name}: argument {index} must be float64 of shape ({width}, {n}) with contiguous rows,"
                 f" got {argument.dtype} of shape {argument.shape}"

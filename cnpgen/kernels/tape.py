@@ -1,5 +1,6 @@
 """A tape: an SX function as a flat list of scalar operations, and the description of the loop that runs it."""
 
+import hashlib
 import io
 from dataclasses import dataclass
 from typing import Any
@@ -65,7 +66,7 @@ class Tape:
         return len(self.operation)
 
     def to_bytes(self) -> bytes:
-        """Serialize; equal tapes give equal bytes."""
+        """Serialize, with a checksum; equal tapes give equal bytes."""
         buffer = io.BytesIO()
         loop = [self.loop.tolerance, float(self.loop.limit)] if self.loop else []
         header = [
@@ -76,7 +77,8 @@ class Tape:
         ]
         for array in (*header, self.operation, self.a, self.b, self.constant):
             np.save(buffer, array, allow_pickle=False)
-        return buffer.getvalue()
+        content = buffer.getvalue()
+        return hashlib.sha256(content).digest() + content
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "Tape":
@@ -85,11 +87,11 @@ class Tape:
         Raises:
             ValueError: The bytes are damaged.
         """
-        buffer = io.BytesIO(data)
-        try:
-            name, inputs, outputs, loop, *program = (np.load(buffer, allow_pickle=False) for _ in range(8))
-        except (EOFError, OSError) as error:
-            raise ValueError(f"damaged tape: {error}") from error
+        checksum, content = data[:32], data[32:]
+        if hashlib.sha256(content).digest() != checksum:
+            raise ValueError("damaged tape: its checksum is wrong")
+        buffer = io.BytesIO(content)
+        name, inputs, outputs, loop, *program = (np.load(buffer, allow_pickle=False) for _ in range(8))
         iteration = Loop(float(loop[0]), int(loop[1])) if len(loop) else None
         operation, a, b, constant = program
         widths = tuple(inputs.tolist()), tuple(outputs.tolist())

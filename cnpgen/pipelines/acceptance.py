@@ -34,28 +34,28 @@ def acceptance(context: Context, written: set[str]) -> Run:
     ends: tuple[End, ...] = ("start", "goal")
     kernels = {
         end: context.kernels.load(
-            boundary_excess, end=end, needs=2 if f"{end}_ddq" in written else 1, dtype=context.dtype
+            boundary_unmet, end=end, needs=2 if f"{end}_ddq" in written else 1, dtype=context.dtype
         )
         for end in ends
     }
-    hitting = context.kernels.load(direction_excess, dtype=context.dtype) if "hit_angle" in written else None
+    hitting = context.kernels.load(direction_unmet, dtype=context.dtype) if "hit_angle" in written else None
     reasons = [constraint.reason for constraint in context.problem.constraint]
     n = context.robot.n
 
     def run(batch: Batch, _random: np.random.Generator) -> None:
         tops = obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
-        excess = []
+        unmet = []
         for end in ends:
             acceleration = batch.columns.get(f"{end}_ddq")
             if acceleration is None:
                 acceleration = np.zeros((n, len(batch.alive)))
-            (worst,) = kernels[end](batch[f"{end}_q"], batch[f"{end}_dq"], acceleration, tops, batch[f"{end}_xyz"])
-            excess.append(worst)
-        met = np.maximum(*excess) <= 0
+            (count,) = kernels[end](batch[f"{end}_q"], batch[f"{end}_dq"], acceleration, tops, batch[f"{end}_xyz"])
+            unmet.append(count)
+        met = np.maximum(*unmet) <= 0
         gates = list(zip([*reasons, "tip not at its position"], met, strict=True))
         if hitting is not None:
-            (worst,) = hitting(batch["goal_q"], batch["goal_dq"], batch["hit_angle"], batch["hit_speed"])
-            gates.append(("hit not along its direction", worst[0] <= 0))
+            (missed,) = hitting(batch["goal_q"], batch["goal_dq"], batch["hit_angle"], batch["hit_speed"])
+            gates.append(("hit not along its direction", missed[0] <= 0))
         alive = batch.alive
         for reason, ok in gates:
             batch.reject(ok[np.searchsorted(alive, batch.alive)], reason)
@@ -63,8 +63,8 @@ def acceptance(context: Context, written: set[str]) -> Run:
     return run
 
 
-def boundary_excess(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str) -> Any:
-    """Build ``(q, dq, ddq, tops, position) -> excess``, positive where a boundary state is not exact.
+def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str) -> Any:
+    """Build ``(q, dq, ddq, tops, position) -> unmet``, positive where a boundary state is not exact or not a number.
 
     Args:
         robot: The robot.
@@ -84,30 +84,31 @@ def boundary_excess(robot: "Robot", problem: Problem, *, end: End, needs: int, d
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
     rows: list[Scalar] = []
     for constraint in problem.constraint:
-        worst: Scalar = ca.SX(-1)
+        unmet: Scalar = ca.SX(0)
         for condition in constraint.symbolic_at(state, end):
             if condition.needs <= needs:
-                worst = _worst(worst, condition.g, condition.lower, condition.upper, condition.slack(dtype))
-        rows.append(worst)
+                unmet = unmet + _unmet(condition.g, condition.lower, condition.upper, condition.slack(dtype))
+        rows.append(unmet)
     miss = subtract(p, state.kinematics.tip)
-    rows.append(ca.sqrt(dot(miss, miss)) - EXACTNESS[dtype]["position"])
-    # nan compares as not met on the other side
+    rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= EXACTNESS[dtype]["position"]))
     return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, tops_sx, p_sx], [ca.vertcat(*rows)])
 
 
-def _worst(worst: Scalar, g: list[Scalar], lower: Array, upper: Array, slack: Array) -> Scalar:
+def _unmet(g: list[Scalar], lower: Array, upper: Array, slack: Array) -> Scalar:
+    """Count the values that are not within their bounds; a nan is within none."""
     import casadi as ca
 
+    count: Scalar = ca.SX(0)
     for value, low, high, room in zip(g, lower, upper, slack, strict=True):
         if np.isfinite(low):
-            worst = ca.fmax(worst, float(low - room) - value)
+            count = count + ca.logic_not(value >= float(low - room))
         if np.isfinite(high):
-            worst = ca.fmax(worst, value - float(high + room))
-    return worst
+            count = count + ca.logic_not(value <= float(high + room))
+    return count
 
 
-def direction_excess(robot: "Robot", *, dtype: str) -> Any:
-    """Build ``(q, dq, angle, speed) -> excess``: the tip must move along the angle, horizontally, at that speed."""
+def direction_unmet(robot: "Robot", *, dtype: str) -> Any:
+    """Build ``(q, dq, angle, speed) -> unmet``: the tip must move along the angle, horizontally, at that speed."""
     import casadi as ca
 
     names = (("q", robot.n), ("dq", robot.n), ("angle", 1), ("speed", 1))
@@ -117,9 +118,9 @@ def direction_excess(robot: "Robot", *, dtype: str) -> Any:
     cosine, sine = ca.cos(angle[0]), ca.sin(angle[0])
     across = ca.fabs(cosine * velocity[1] - sine * velocity[0])
     along = cosine * velocity[0] + sine * velocity[1] - speed[0]
-    exact = EXACTNESS[dtype]
-    excess = ca.fmax(across - exact["velocity"], ca.fabs(along) - exact["velocity"])
-    return ca.Function("direction", [q_sx, dq_sx, angle_sx, speed_sx], [excess])
+    exact = EXACTNESS[dtype]["velocity"]
+    met = ca.logic_and(across <= exact, ca.fabs(along) <= exact)
+    return ca.Function("direction", [q_sx, dq_sx, angle_sx, speed_sx], [ca.logic_not(met)])
 
 
 def bookkeeping_fields() -> tuple[Field, ...]:

@@ -36,12 +36,12 @@ class BrakingReach(Stage):
     """Full braking keeps the tip over the table, at the start and, reversed in time, at the goal."""
 
     needs = ("start_q", "start_dq", "goal_q", "goal_dq")
-    margin: float = field("how far beyond the edge greedy braking may end", unit="m", default=1e-3)
+    margin: float = field("how far before the edge full braking must end", unit="m", default=1e-3)
 
     def describe(self) -> str:
         """Say what is kept."""
         return (
-            f"require that full braking ends less than {1e3 * self.margin:g} mm beyond every edge of the table, from"
+            f"require that full braking ends at least {1e3 * self.margin:g} mm before every edge of the table, from"
             " the start forwards and from the goal backwards in time (loses about 0.15 % of the solvable problems,"
             " where the ballistic rule loses 13.7 %)"
         )
@@ -60,7 +60,7 @@ class BrakingReach(Stage):
         def run(batch: Batch, _random: np.random.Generator) -> None:
             for end, sign in (("start", 1.0), ("goal", -1.0)):
                 excess = overshoot(tip, brake, table, batch[f"{end}_q"], sign * batch[f"{end}_dq"])
-                batch.reject(excess <= self.margin, f"cannot brake at the {end}")
+                batch.reject(excess <= -self.margin, f"cannot brake at the {end}")
 
         return run
 
@@ -87,7 +87,7 @@ def overshoot(tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array) -> 
             continue
         normal = np.zeros((3, len(suspect)))
         normal[axis], normal[2] = side, side * edge
-        state = np.concatenate([q[:, suspect], dq[:, suspect], np.full((1, len(suspect)), -1.0)])
+        state = np.concatenate([np.take(q, suspect, 1), np.take(dq, suspect, 1), np.full((1, len(suspect)), -1.0)])
         final, running = brake(state, normal)
         worst[suspect] = np.maximum(worst[suspect], np.where(running[0] < 0.5, final[-1], np.inf))
     return worst

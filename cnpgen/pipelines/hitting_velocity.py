@@ -71,7 +71,8 @@ class HittingVelocity(Stage):
             factor, choice = batch.draw(random, 1), batch.draw(random, 1)
             factor = np.where(choice < self.full_speed, 1.0, factor)
             batch["goal_dq"], batch["hit_speed"], batch["hit_speed_max"] = velocity * factor, speed * factor, speed
-            batch.reject(np.isfinite(velocity).all(0) & (speed[0] >= self.min_speed), "no hitting velocity")
+            solved = np.isfinite(velocity).all(0) & np.isfinite(speed[0])  # not where the Jacobian is singular
+            batch.reject(solved & (speed[0] >= self.min_speed), "no hitting velocity")
 
         return run
 

@@ -1,5 +1,7 @@
 """A pipeline ready to run: blocks of rows, each a pure function of (seed, split, block index)."""
 
+import hashlib
+import json
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +17,7 @@ from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.pipelines.tally import Tally
-from cnpgen.recipes import Pipeline
+from cnpgen.recipes import Pipeline, Problem, resolved
 from cnpgen.robots.robot import load_robot
 from cnpgen.store.outcome import Outcome
 
@@ -62,7 +64,7 @@ class PreparedPipeline:
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
         problem = pipeline.problem
         robot = load_robot(problem)
-        kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})
+        kernels = KernelLibrary(backend, cache_folder, _identity(problem), {"robot": robot, "problem": problem})
         self.pipeline = pipeline
         self.context = Context(problem, robot, kernels, dtype)
         self.fields = _ordered_fields(pipeline, self.context)
@@ -92,7 +94,7 @@ class PreparedPipeline:
             taken = batch.alive[: stop - made]
             skip = min(max(first - made, 0), len(taken))
             made += len(taken)
-            if made > first or first == 0:
+            if made >= first:
                 attempts = tally.count(batch, taken, first=skip, last=made == stop)
                 part = {field.name: batch[field.name][:, skip : len(taken)] for field in self.fields[:-2]}
                 parts.append({**part, "attempts": attempts[None]})
@@ -138,6 +140,13 @@ def as_stored(values: Array, field: Field) -> Array:
             stored = np.where(beyond(stored, limit), np.nextafter(stored, np.float32(inwards)), stored)
             rounded = np.where(beyond(rounded, limit) & ~beyond(values, limit), stored, rounded)
     return rounded.astype(np.float64)
+
+
+def _identity(problem: Problem) -> str:
+    """Digest of what kernels are built from: the problem as it is, wherever it came from, and its URDF."""
+    content = resolved(problem)
+    del content["title"], content["robot"]["urdf"]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode() + problem.urdf_path.read_bytes()).hexdigest()
 
 
 def _round_size(made: int, tried: int) -> int:

@@ -1,8 +1,9 @@
 """Sequential quadratic programming with a trust region and DAQP, for one motion.
 
-Each step minimises a quadratic model of the objective subject to the linearised residuals. Violated residuals are relaxed by one
-elastic variable: the step may leave the fraction ``beta`` of every violation. The merit function is the objective plus a multiple
-of the worst violation. A proximal term on the step makes the model strictly convex where the objective is flat.
+Each step minimises a quadratic model of the objective subject to the linearised residuals. Violated residuals are
+relaxed by one elastic variable: the step may leave the fraction ``beta`` of every violation. The merit function is
+the objective plus a multiple of the worst violation. A proximal term on the step makes the model strictly convex
+where the objective is flat.
 """
 
 from dataclasses import dataclass
@@ -93,7 +94,7 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
     multipliers: Array | None = None
     converged = False
     iteration = 0
-    for iteration in range(1, settings.max_iterations + 1):  # noqa: B007
+    for iteration in range(1, settings.max_iterations + 1):
         chosen = _choose(at.g, bounds, settings.thin, 0.4 if length > 0.2 else 0.2 if length > 0.05 else 0.1)
         step = _solve(motion, at, bounds, chosen, multipliers, settings, radius * scale, violation)
         if step is None:

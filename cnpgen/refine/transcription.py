@@ -1,9 +1,10 @@
 """The optimisation problem of one motion: variables, residuals on a Chebyshev grid, and their derivatives.
 
-Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold by
+Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
+by
 construction: the boundary control points are functions of the first and last rate control points (paper, Appendix A).
-Residuals are the problem's constraints, each divided by a natural size (a limit by itself, an equality by its tolerance), so
-that a violation of 1e-3 means the same everywhere.
+Residuals are the problem's constraints, each divided by a natural size (a limit by itself, an equality by its
+tolerance), so that a violation of 1e-3 means the same everywhere.
 """
 
 from dataclasses import dataclass
@@ -223,7 +224,7 @@ class Transcription:
         return slopes
 
     def _end_slopes(self, dq: Array, ddq: Array, outer: float, inner: float) -> tuple[Array, Array, Array]:
-        """d c1 / d log r0, d c2 / d log r0, d c2 / d log r1 at one end."""
+        """Return d c1 / d log r0, d c2 / d log r0 and d c2 / d log r1 at one end."""
         path = end_derivatives(self.spec.path_control_points, self.spec.degree)
         eta = end_derivatives(self.spec.rate_control_points, self.spec.degree).eta
         c1 = -dq / (outer * path.eta)

@@ -133,23 +133,39 @@ def check_shard(folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[st
     Raises:
         MachineError: The system would not let us read it.
     """
+    path = folder / task.file
     findings, expected = _check_sidecar(folder, plan, task, entry)
-    if not (folder / task.file).is_file():
+    if not path.is_file():
         return [*findings, Finding(task.file, "is missing")]
-    size, sha256 = expected
-    found = (folder / task.file).stat().st_size
-    if size is not None and found != size:
-        findings.append(Finding(task.file, f"has {found} bytes instead of {size}"))
-    elif sha256 is not None:
-        findings += _check_digest(folder, task.file, sha256)
-    return findings + _check_content(folder, plan, task)
+    if expected is None:  # nobody knows what the file should be, and findings says why
+        return findings
+    damage = _check_file(folder, task.file, *expected)
+    if damage and not _is_of_another_plan(path, plan):
+        return findings + damage  # what HDF5 makes of a damaged file tells nothing, and may take forever
+    return findings + damage + check_content(folder, plan, task)
+
+
+def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding]:
+    """Compare a file with its recorded size and digest."""
+    found = (folder / name).stat().st_size
+    if found != size:
+        return [Finding(name, f"has {found} bytes instead of {size}")]
+    return _check_digest(folder, name, sha256)
+
+
+def _is_of_another_plan(path: Path, plan: DatasetPlan) -> bool:
+    """Whether a shard that is not the recorded one is a sound shard of another plan."""
+    try:
+        return read_attributes(path, ["plan_key"])["plan_key"] != plan.key
+    except DatasetError:
+        return False
 
 
 def _check_sidecar(
     folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[str, Any] | None
-) -> tuple[list[Finding], tuple[int | None, str | None]]:
+) -> tuple[list[Finding], tuple[int, str] | None]:
     """Check a sidecar; return also the size and digest that the shard should have, as far as somebody knows."""
-    expected = (None, None) if entry is None else (entry["bytes"], entry["sha256"])
+    expected = None if entry is None else (entry["bytes"], entry["sha256"])
     try:
         record = load_record(folder, task)
     except DatasetError as error:
@@ -157,11 +173,20 @@ def _check_sidecar(
     findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
     if record.plan_fingerprint != plan.fingerprint:
         findings.append(Finding(task.sidecar, f"belongs to another plan ({record.plan_fingerprint[:12]}...)"))
-    return findings, expected if entry is not None else (record.bytes, record.sha256)
+    return findings, expected or (record.bytes, record.sha256)
 
 
-def _check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Finding]:
-    """Compare what a shard says about itself with the plan."""
+def check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Finding]:
+    """Compare what a shard says about itself with the plan.
+
+    Args:
+        folder: The dataset's folder.
+        plan: Its plan.
+        task: Which shard; its file should be known to be as it was written (see :func:`read_attributes`).
+
+    Returns:
+        What is wrong: attributes, fields, shapes, types, units.
+    """
     path = folder / task.file
     try:
         attributes, schema = read_attributes(path), read_schema(path)

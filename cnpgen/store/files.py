@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -123,9 +124,14 @@ def file_sha256(path: Path) -> str:
         raise machine_error("read", path, error) from error
 
 
-def sweep(work: Path) -> None:
-    """Remove what killed processes left in ``work``, and ``work`` itself if nothing else is in it."""
+def sweep(work: Path, *, older_than: float = 3600.0) -> None:
+    """Remove what killed processes left in ``work``, but not what others, maybe on other machines, are writing now.
+
+    Args:
+        work: The folder for temporary files; what is not one of ours is kept.
+        older_than: Age of the files that surely nobody writes any more [s].
+    """
     with suppress(OSError):
         for leftover in work.glob(".*.tmp"):
-            leftover.unlink(missing_ok=True)
-        work.rmdir()
+            if time.time() - leftover.stat().st_mtime >= older_than:
+                leftover.unlink(missing_ok=True)

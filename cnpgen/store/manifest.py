@@ -4,11 +4,12 @@ import hashlib
 import os
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError
 from cnpgen.fields import Field
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
@@ -25,6 +26,8 @@ FORMAT_VERSION = 1
 def finalize(folder: Path, *, notes: str = "", citation: str = "") -> dict[str, Any]:
     """Sum up the shards of a dataset: statistics, card, Croissant and, last, the manifest.
 
+    The same shards give the same files; processes that find all shards made may do it at once.
+
     Args:
         folder: The dataset's folder.
         notes: Text about the dataset to include in its card, Markdown.
@@ -37,17 +40,24 @@ def finalize(folder: Path, *, notes: str = "", citation: str = "") -> dict[str, 
         DatasetError: Shards are missing, damaged or of another plan; the message says which.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    work = folder / WORK
-    created = _now()
     summary = summarise(folder, load_plan(folder))
+    created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
-    save_document(folder / STATS, stats_document(summary), work=work)
-    write_file(folder / CARD, card_text(summary, folder=folder.resolve().name, notes=notes), work=work)
+    save_document(folder / STATS, stats_document(summary))
+    write_file(folder / CARD, card_text(summary, folder=folder.resolve().name, notes=notes))
     croissant = plain(croissant_document(summary, created=created, citation=citation))
-    write_file(folder / CROISSANT, render(croissant) + "\n", work=work)
-    save_document(folder / MANIFEST, _manifest(folder, summary, created=created, citation=citation), work=work)
-    sweep(work)
-    return load_manifest(folder)
+    write_file(folder / CROISSANT, render(croissant) + "\n")
+    manifest = _manifest(folder, summary, created=created, citation=citation)
+    save_document(folder / MANIFEST, manifest)
+    _remove_work(folder / WORK)
+    return cast(dict[str, Any], plain(manifest))
+
+
+def _remove_work(work: Path) -> None:
+    """Remove the folder for temporary files: every shard is committed, so nobody needs it; foreign files are kept."""
+    sweep(work, older_than=0.0)
+    with suppress(OSError):
+        work.rmdir()
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
@@ -60,14 +70,19 @@ def load_manifest(folder: Path) -> dict[str, Any]:
     return load_document(folder / MANIFEST, FORMAT, version=FORMAT_VERSION)
 
 
-def _now() -> str:
-    """Return the time in UTC, or what SOURCE_DATE_EPOCH says, as ISO 8601 to the second."""
+def _created(summary: Summary) -> str:
+    """Return when the work on the last shard began, or what SOURCE_DATE_EPOCH says, in UTC to the second.
+
+    It does not depend on when the dataset is finished: doing that twice, even at the same time, gives the same files.
+    """
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     try:
-        seconds = int(epoch) if epoch else int(time.time())
-        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        started = [datetime.fromisoformat(record.started) for _, record in summary.records if record.started]
+        last = max((moment.timestamp() for moment in started), default=time.time())
+        return datetime.fromtimestamp(int(epoch or last), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        raise UsageError(f"SOURCE_DATE_EPOCH must be a number of seconds since 1970, got {epoch!r}") from error
+        message = f"SOURCE_DATE_EPOCH is {epoch!r}" if epoch else "a shard's record has an unreadable start"
+        raise DatasetError(f"cannot tell when the dataset was made: {message} ({error})") from error
 
 
 def _manifest(folder: Path, summary: Summary, *, created: str, citation: str) -> dict[str, Any]:

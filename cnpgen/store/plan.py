@@ -96,6 +96,11 @@ class DatasetPlan:
         identity = {key: value for key, value in to_json(self).items() if key not in _INFORMATIONAL}
         return canonical_sha256(identity)
 
+    @property
+    def key(self) -> int:
+        """The first 60 bits of the fingerprint: HDF5 stores numbers under a checksum, texts not."""
+        return int(self.fingerprint[:15], 16)
+
     def field_named(self, name: str) -> Field:
         """Return the field called ``name``.
 
@@ -162,6 +167,7 @@ def shard_attributes(plan: DatasetPlan, task: ShardTask) -> dict[str, str | int]
         "rows": task.rows,
         "recipe_sha256": plan.recipe_sha256,
         "plan_fingerprint": plan.fingerprint,
+        "plan_key": plan.key,
         "root_seed": str(plan.seed),
         "generator": plan.generator,
         "backend": plan.backend,

@@ -113,7 +113,7 @@ def commit_shard(
     seconds: float = 0.0,
     versions: Mapping[str, str] | None = None,
 ) -> ShardRecord:
-    """Write a shard and then its sidecar; doing it twice is harmless.
+    """Write a shard and then its sidecar; doing it twice is harmless: what is committed stays as it is.
 
     Args:
         folder: The dataset's folder.
@@ -132,6 +132,8 @@ def commit_shard(
         DatasetError: The columns are not what the plan says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
+    if is_committed(folder, task, plan.fingerprint):  # by somebody to whom the same work was given
+        return load_record(folder, task)
     path = folder / task.file
     size = write_shard(path, columns, plan.fields, shard_attributes(plan, task), dtype=plan.dtype, work=folder / WORK)
     record = ShardRecord(

@@ -182,15 +182,25 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
         return {name: file[name][()] for name in (known if fields is None else fields)}
 
 
-def read_attributes(path: Path) -> dict[str, str | int]:
+def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
     """Read a shard's file attributes.
 
+    HDF5 2.0 can hang on a text of a file that was changed: compare the file's sha256 before, or ask for numbers only.
+
+    Args:
+        path: The shard.
+        names: Names of the attributes; all by default.
+
+    Returns:
+        Name -> value.
+
     Raises:
-        DatasetError: The file is missing, damaged or cut off.
+        DatasetError: The file is missing, damaged or cut off, or has no such attribute.
         MachineError: The system would not let us read it.
     """
     with _opened(path) as file:
-        return {name: value if isinstance(value, str) else int(value) for name, value in file.attrs.items()}
+        values = {name: file.attrs[name] for name in (file.attrs if names is None else names)}
+        return {name: value if isinstance(value, str) else int(value) for name, value in values.items()}
 
 
 @dataclass(frozen=True, eq=False)

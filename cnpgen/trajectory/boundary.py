@@ -40,9 +40,14 @@ class Boundary:
         return len(self.start_q)
 
     def __getitem__(self, index: slice | Array) -> "Boundary":
-        goal = None if self.goal_ddq is None else self.goal_ddq[index]
-        parts = (self.start_q, self.start_dq, self.start_ddq, self.goal_q, self.goal_dq)
-        return Boundary(*(np.atleast_2d(part[index]) for part in parts), goal)
+        return Boundary(
+            self.start_q[index],
+            self.start_dq[index],
+            self.start_ddq[index],
+            self.goal_q[index],
+            self.goal_dq[index],
+            None if self.goal_ddq is None else self.goal_ddq[index],
+        )
 
 
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
@@ -108,7 +113,7 @@ def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectoryS
 
 
 def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """Interior control points for network outputs of zero: the line from C_2 to C_{C - N_d} (paper, eq. configuration points).
+    """Interior control points on the line from C_2 to C_{C - N_d} (paper, eq. of the configuration points).
 
     Returns:
         Shape (N, C - 3 - N_d, n).

@@ -1,4 +1,4 @@
-"""N motions of one robot: evaluation of positions and their derivatives in time, duration, time as a function of phase."""
+"""N motions of one robot: positions and their derivatives in time, duration, time as a function of phase."""
 
 from dataclasses import dataclass
 

@@ -98,7 +98,7 @@ def judge(name: str, unit: str, *, violation: Array, allowed: Array, row: Index,
         return Check(name, unit, 0.0, 0.0, 0, -1, "start"), np.empty(0, np.int64)
     violation = np.where(np.isnan(violation), np.inf, violation)
     out = np.unique(row[violation > allowed])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         severity = np.where(violation > 0, violation / allowed, 0.0)
     worst = int(np.argmax(severity))
     where = int(row[worst]), ENDS[int(end[worst])]

@@ -1,5 +1,6 @@
 """Recompute what rows claim from their stored numbers: every constraint at both ends, positions and hits."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
@@ -58,7 +59,8 @@ def verify_rows(
     world = World(problem, robot)
     slices = [slice(first, first + BLOCK) for first in range(0, max(rows, 1), BLOCK)]
     blocks = ({name: column[part] for name, column in values.items()} for part in slices)
-    return merge([_verify_block(problem, world, block, dtype) for block in blocks])
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too large to compute with becomes inf or nan: it fails
+        return merge([_verify_block(problem, world, block, dtype) for block in blocks])
 
 
 def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
@@ -72,7 +74,7 @@ def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
     for name, column in values.items():
         if len(column) != rows or (name in widths and column.shape != (rows, widths[name])):
             raise DatasetError(f"field {name} must have shape ({rows}, {widths.get(name, '...')}), got {column.shape}")
-    return {name: column.reshape(rows, -1) for name, column in values.items()}
+    return {name: column.reshape(rows, math.prod(column.shape[1:])) for name, column in values.items()}
 
 
 @dataclass

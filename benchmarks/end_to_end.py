@@ -1,0 +1,278 @@
+"""Wall time of whole ``cnpgen make-dataset`` processes: the documentation's table of datasets and its memory figures.
+
+Every repetition runs all cases in turn; times are medians. "Warm" runs find their kernels in the cache; "empty" runs
+get a fresh ``CNPGEN_CACHE`` and build and compile them. The start-up table says what passes before the first row.
+
+    python benchmarks/end_to_end.py
+    python benchmarks/end_to_end.py --large 10000000    does a worker's memory grow? (takes 0.35 GB per million rows)
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from common import arguments, median, progress, report, table, verdict
+
+from cnpgen.store.plan import default_shard_size
+
+STEPS = (  # cumulative: what a process does before the first row, and what each step adds
+    ("Python", "pass"),
+    ("NumPy", "import numpy"),
+    ("cnpgen.make", "import cnpgen.make"),
+    ("recipe", "from cnpgen.library import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
+    ("Pinocchio, Coal", "import pinocchio, coal"),
+    ("kernels, plan", "cnpgen.make.plan_dataset(recipe, {out!r})"),
+    ("h5py", "import h5py"),
+    ("joblib", "from joblib import Parallel, delayed"),
+    ("2 workers", "Parallel(n_jobs=2)(delayed(abs)(i) for i in range(2))"),
+    ("cnpgen in workers", "Parallel(n_jobs=2)(delayed(cnpgen.make.plan_dataset)(recipe, {out!r}) for i in range(2))"),
+)
+MARKS = (0.1, 0.5, 1.0)
+
+
+@dataclass
+class Case:
+    """A dataset, made from the beginning.
+
+    Attributes:
+        walls: Wall times [s].
+        cpus: CPU times of all its processes [s].
+    """
+
+    name: str
+    rows: int
+    workers: int
+    warm: bool
+    target: float | None = None  # s
+    walls: list[float] = field(default_factory=list)
+    cpus: list[float] = field(default_factory=list)
+
+    @property
+    def wall(self) -> float:
+        """Median wall time [s]."""
+        return median(self.walls)
+
+    def run(self, folder: Path) -> None:
+        """Make the dataset once."""
+        cache = Path(tempfile.mkdtemp(prefix="empty-cache-", dir=folder)) if not self.warm else folder / "cache"
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            command = make_command(self.name, self.rows, self.workers, Path(out) / "dataset")
+            before, start = _children(), time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True, env=environment(cache))
+            self.walls.append(time.perf_counter() - start)
+            self.cpus.append(_children() - before)
+
+
+CASES = (
+    Case("airhockey-replan", 120_000, 2, True, 5.0),
+    Case("airhockey-replan", 120_000, 1, True),
+    Case("heavy-object", 26_400, 2, True),
+    Case("heavy-object", 26_400, 1, True),
+    Case("airhockey-hit", 19_800, 2, True),
+    Case("airhockey-hit", 19_800, 1, True),
+    Case("airhockey-replan", 120_000, 2, False, 20.0),
+    Case("heavy-object", 26_400, 2, False),
+    Case("airhockey-hit", 19_800, 2, False),
+)
+
+
+def make_command(name: str, rows: int, workers: int, out: Path) -> list[str]:
+    """Return the command that makes a dataset."""
+    options = ["--n", str(rows), "--workers", str(workers), "--out", str(out), "--quiet"]
+    return [sys.executable, "-m", "cnpgen", "make-dataset", name, *options]
+
+
+def environment(cache: Path) -> dict[str, str]:
+    """Return the environment of a run. Modules keep their bytecode, as those of an installed package do."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return kept | {"CNPGEN_CACHE": str(cache)}
+
+
+def _children() -> float:
+    """CPU time of all processes that have ended [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def measure(folder: Path, repeat: int, cold: int) -> list[Case]:
+    """Run the warm cases ``repeat`` times in turn, the others ``cold`` times."""
+    for case in CASES:
+        if case.warm:
+            case.run(folder)  # fills the cache
+            case.walls.clear()
+            case.cpus.clear()
+    for number in range(max(repeat, cold)):
+        progress(f"repetition {number + 1} of {max(repeat, cold)}")
+        for case in CASES:
+            if number < (repeat if case.warm else cold):
+                case.run(folder)
+    return list(CASES)
+
+
+def measure_start(folder: Path, name: str, repeat: int) -> list[tuple[str, float]]:
+    """Time processes that do the first 1, 2, 3, ... steps of a start; return what each step adds [s]."""
+    lines = [line.format(name=name, out=str(folder / "none")) for _, line in STEPS]
+    walls: list[list[float]] = [[] for _ in STEPS]
+    for _ in range(repeat):
+        for count, found in enumerate(walls, start=1):
+            start = time.perf_counter()
+            command = [sys.executable, "-c", "\n".join(lines[:count])]
+            subprocess.run(command, check=True, env=environment(folder / "cache"))
+            found.append(time.perf_counter() - start)
+    total = [median(found) for found in walls]
+    return [(step, now - before) for (step, _), now, before in zip(STEPS, total, [0.0, *total], strict=False)]
+
+
+def case_table(cases: list[Case]) -> str:
+    rows = []
+    for case in cases:
+        single = next((c for c in cases if (c.name, c.workers, c.warm) == (case.name, 1, case.warm)), None)
+        pairs = zip(case.walls, single.walls, strict=True) if single and single is not case else ()
+        ratio = median(a / b for a, b in pairs)
+        rows.append(
+            (
+                *(case.name, f"{case.rows:,}", str(case.workers), "warm" if case.warm else "empty"),
+                *(f"{case.wall:.2f}", f"{min(case.walls):.2f}", f"{median(case.cpus):.2f}"),
+                f"{case.rows / case.wall:,.0f}",
+                "" if ratio != ratio else f"{ratio:.2f}",
+                *verdict(case.wall, case.target, at_most=True),
+            )
+        )
+    head = (
+        "dataset",
+        "rows",
+        "workers",
+        "cache",
+        "wall [s]",
+        "best",
+        "CPU [s]",
+        "rows/s",
+        "wall / 1 worker",
+        "target",
+        "",
+    )
+    return table("Whole processes, wall time (median)", head, rows)
+
+
+def start_table(name: str, steps: list[tuple[str, float]]) -> str:
+    rows = [(step, f"{1e3 * seconds:.0f}") for step, seconds in steps]
+    rows.append(("together", f"{1e3 * sum(seconds for _, seconds in steps):.0f}"))
+    return table(f"Start-up of {name}, warm: wall time that each step adds (median)", ("step", "ms"), rows)
+
+
+@dataclass
+class Sample:
+    """Memory of the processes of a run at one moment.
+
+    Attributes:
+        done: Share of the rows that are there.
+        seconds: Time since the start [s].
+        peaks: Process id -> ("maker" or "worker", peak of its resident memory [MiB], resident memory now [MiB]).
+    """
+
+    done: float
+    seconds: float
+    peaks: dict[int, tuple[str, float, float]]
+
+
+def watch(process: "subprocess.Popen[bytes]", out: Path, rows: int) -> list[Sample]:
+    """Sample a run until it ends; return the moments when ``MARKS`` were reached, the last one just before the end."""
+    start, found, latest = time.perf_counter(), [], Sample(0.0, 0.0, {})
+    while process.poll() is None:
+        peaks = memory(process.pid)
+        if any(kind == "worker" for kind, _, _ in peaks.values()):
+            latest = Sample(committed(out, rows) / rows, time.perf_counter() - start, peaks)
+        if len(found) < len(MARKS) - 1 and latest.done >= MARKS[len(found)]:
+            found.append(latest)
+            progress(f"{latest.done:.0%} after {latest.seconds:.1f} s")
+        time.sleep(0.05)
+    return [*found, latest]
+
+
+def committed(out: Path, rows: int) -> int:
+    """Count the rows of the shards that are there, as if all were of full size."""
+    return min(len(list(out.glob("*/shard-*.json"))) * default_shard_size(rows), rows)
+
+
+def memory(pid: int) -> dict[int, tuple[str, float, float]]:
+    """Read the memory of a process and of its workers."""
+    found = {}
+    for child in (pid, *children(pid)):
+        try:
+            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8", errors="replace")
+            status = dict(line.split(":", 1) for line in Path(f"/proc/{child}/status").read_text().splitlines())
+            sizes = [int(status[name].split()[0]) / 1024 for name in ("VmHWM", "VmRSS")]
+        except (OSError, KeyError, ValueError):
+            continue  # it has just ended
+        kind = "maker" if child == pid else "worker" if "popen_loky" in command else "other"
+        if kind != "other":
+            found[child] = (kind, sizes[0], sizes[1])
+    return found
+
+
+def children(pid: int) -> list[int]:
+    """List the children of a process and theirs."""
+    try:
+        text = "".join(path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children"))
+    except OSError:
+        return []
+    direct = [int(word) for word in text.split()]
+    return [*direct, *(grandchild for child in direct for grandchild in children(child))]
+
+
+def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
+    """Make a large dataset once; return its wall time [s] and its samples."""
+    out = folder / "large"
+    start = time.perf_counter()
+    command = make_command("airhockey-replan", rows, 2, out)
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment(folder / "cache")) as process:
+        samples = watch(process, out, rows)
+    if process.returncode:
+        sys.exit(f"make-dataset failed with exit code {process.returncode}")
+    return time.perf_counter() - start, samples
+
+
+def large_table(rows: int, wall: float, samples: list[Sample]) -> str:
+    lines = [
+        (f"{mark:.0%}", f"{sample.seconds:.1f}", str(pid), kind, f"{peak:.1f}", f"{now:.1f}")
+        for mark, sample in zip(MARKS, samples, strict=True)
+        for pid, (kind, peak, now) in sample.peaks.items()
+    ]
+    head = ("rows", "after [s]", "process", "", "peak RSS [MiB]", "RSS [MiB]")
+    title = f"airhockey-replan, {rows:,} rows, 2 workers: {wall:.1f} s, {rows / wall:,.0f} rows/s"
+    return table(title, head, lines)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--repeat", type=int, default=5, help="runs with a warm cache")
+    parser.add_argument("--cold", type=int, default=2, help="runs with an empty cache")
+    parser.add_argument("--large", type=int, metavar="N", help="make N rows and watch the workers' memory instead")
+    parser.add_argument(
+        "--folder", type=Path, help="where datasets are made, and deleted again; default a temporary one"
+    )
+
+
+def main() -> None:
+    options = arguments(__doc__, add_options)
+    with tempfile.TemporaryDirectory(prefix="cnpgen-benchmark-", dir=options.folder) as name:
+        folder = Path(name)
+        if options.large:
+            wall, samples = run_large(folder, options.large)
+            results: dict[str, Any] = {"rows": options.large, "wall": wall, "samples": [vars(s) for s in samples]}
+            report(results, [large_table(options.large, wall, samples)], as_json=options.json)
+            return
+        cases = measure(folder, options.repeat, options.cold)
+        steps = measure_start(folder, "airhockey-replan", options.repeat)
+    results = {"cases": [vars(case) for case in cases], "start": dict(steps)}
+    report(results, [case_table(cases), start_table("airhockey-replan", steps)], as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

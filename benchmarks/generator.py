@@ -1,0 +1,187 @@
+"""Accepted rows per second and core: the documentation's table of generator speeds, stage by stage.
+
+The clock is the process's CPU time, so that other processes disturb little. Every repetition measures all cases in
+turn; rates are medians over the repetitions, ratios medians of the ratios within one repetition.
+
+    python benchmarks/generator.py
+    python benchmarks/generator.py --backend compiled numpy casadi --repeat 3
+"""
+
+import argparse
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from common import arguments, median, progress, report, table, verdict
+
+from cnpgen.describe import kind_name
+from cnpgen.kernels.library import choose_backend
+from cnpgen.library import load_pipeline
+from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
+from cnpgen.pipelines.stage import Batch, Run, Stage
+
+PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object")
+BLOCKS = {"compiled": 16, "numpy": 2, "casadi": 1}  # per repetition: about half a second each
+TARGETS = {  # accepted rows per second and core
+    ("airhockey-replan", "compiled"): 120_000,
+    ("airhockey-replan", "numpy"): 12_000,
+    ("heavy-object", "compiled"): 45_000,
+}
+
+
+@dataclass
+class StageTime:
+    """CPU time of one stage [s], and the draws that entered and left it."""
+
+    name: str
+    seconds: float = 0.0
+    entered: int = 0
+    left: int = 0
+
+    def timed(self, run: Run) -> Run:
+        """Wrap the stage's function."""
+
+        def timed(batch: Batch, random: Any) -> None:
+            self.entered += len(batch.alive)
+            start = time.process_time()
+            run(batch, random)
+            self.seconds += time.process_time() - start
+            self.left += len(batch.alive)
+
+        return timed
+
+
+@dataclass
+class Case:
+    """One pipeline on one backend, and what was measured of it.
+
+    Attributes:
+        rates: Accepted rows per second of CPU time, one per repetition.
+        stages: Time of each stage, the last gate included.
+        total: Time of the blocks that the stages were timed in [s].
+        rows: Accepted rows of these blocks.
+        drawn: Their draws.
+    """
+
+    pipeline: str
+    backend: str
+    prepared: PreparedPipeline
+    next_block: int = 0
+    rates: list[float] = field(default_factory=list)
+    stages: list[StageTime] = field(default_factory=list)
+    total: float = 0.0
+    rows: int = 0
+    drawn: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Median rate."""
+        return median(self.rates)
+
+    def make(self, blocks: int) -> tuple[float, int]:
+        """Make fresh blocks; return the CPU time [s] and the number of draws."""
+        start, drawn = time.process_time(), 0
+        for _ in range(blocks):
+            drawn += self.prepared.block(1, "benchmark", self.next_block).outcome.tried
+            self.next_block += 1
+        return time.process_time() - start, drawn
+
+
+def prepare(pipeline: str, backend: str) -> Case:
+    """Load a pipeline and run one block to warm it up."""
+    chosen, cache_folder = choose_backend(backend)
+    case = Case(pipeline, backend, PreparedPipeline(load_pipeline(pipeline), backend=chosen, cache_folder=cache_folder))
+    case.make(1)
+    return case
+
+
+def measure_rates(cases: list[Case], repeat: int, blocks: dict[str, int]) -> None:
+    """Measure all cases in turn, ``repeat`` times."""
+    for number in range(repeat):
+        progress(f"repetition {number + 1} of {repeat}")
+        for case in cases:
+            seconds, _ = case.make(blocks[case.backend])
+            case.rates.append(blocks[case.backend] * BLOCK_ROWS / seconds)
+
+
+def measure_stages(case: Case, blocks: int) -> None:
+    """Time every stage of some blocks."""
+    prepared = case.prepared
+    case.stages = [StageTime(name) for name in [*map(_label, prepared.pipeline.stage), "(last gate)"]]
+    runs: list[Run] = [*prepared._stages, prepared._accept]
+    *prepared._stages, prepared._accept = [stage.timed(run) for stage, run in zip(case.stages, runs, strict=True)]
+    case.total, case.drawn = case.make(blocks)
+    case.rows = blocks * BLOCK_ROWS
+    *prepared._stages, prepared._accept = runs
+
+
+def _label(stage: Stage) -> str:
+    details = [getattr(stage, key, None) for key in ("end", "judge")]
+    return " ".join([kind_name(stage), *(str(detail) for detail in details if detail)])
+
+
+def rate_table(cases: list[Case]) -> str:
+    rows = []
+    for case in cases:
+        first = next(other for other in cases if other.pipeline == case.pipeline)
+        ratio = median(a / b for a, b in zip(first.rates, case.rates, strict=True))
+        numbers = (f"{case.rate:,.0f}", f"{max(case.rates):,.0f}", f"{1e6 / case.rate:.2f}")
+        draws = f"{case.drawn / case.rows:.3f}"
+        target = TARGETS.get((case.pipeline, case.backend))
+        rows.append((case.pipeline, case.backend, *numbers, draws, f"{ratio:.1f}", *verdict(case.rate, target)))
+    head = ("pipeline", "backend", "rows/s/core", "best", "us/row", "draws/row", "times slower", "target", "")
+    return table("Accepted rows per second of CPU time (median, and best repetition)", head, rows, left=2)
+
+
+def stage_table(case: Case) -> str:
+    rows = [
+        (stage.name, f"{100 * stage.seconds / case.total:.1f} %", f"{1e6 * stage.seconds / case.rows:.3f}",
+         f"{100 * stage.left / max(stage.entered, 1):.2f} %")
+        for stage in case.stages
+    ]  # fmt: skip
+    rest = case.total - sum(stage.seconds for stage in case.stages)
+    rows.append(
+        ("(rounds, counting, joining)", f"{100 * rest / case.total:.1f} %", f"{1e6 * rest / case.rows:.3f}", "")
+    )
+    return table(f"{case.pipeline}, {case.backend}", ("stage", "share", "us/row", "passes"), rows)
+
+
+def results(cases: list[Case]) -> dict[str, Any]:
+    return {
+        "cases": [
+            {
+                "pipeline": case.pipeline,
+                "backend": case.backend,
+                "rows_per_second": case.rate,
+                "repetitions": case.rates,
+                "draws_per_row": case.drawn / case.rows,
+                "target": TARGETS.get((case.pipeline, case.backend)),
+                "stage_seconds": {
+                    f"{number}. {stage.name}": stage.seconds for number, stage in enumerate(case.stages, 1)
+                },
+                "total_seconds": case.total,
+            }
+            for case in cases
+        ]
+    }
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--pipeline", nargs="+", default=PIPELINES, help="which pipelines")
+    parser.add_argument("--backend", nargs="+", default=("compiled", "numpy"), choices=BLOCKS, help="which backends")
+    parser.add_argument("--repeat", type=int, default=9, help="repetitions")
+    parser.add_argument("--blocks", type=int, help=f"blocks of {BLOCK_ROWS} rows per repetition; default {BLOCKS}")
+
+
+def main() -> None:
+    options = arguments(__doc__, add_options)
+    blocks = {name: options.blocks or number for name, number in BLOCKS.items()}
+    cases = [prepare(pipeline, backend) for pipeline in options.pipeline for backend in options.backend]
+    measure_rates(cases, options.repeat, blocks)
+    for case in cases:
+        measure_stages(case, 2 * blocks[case.backend])
+    report(results(cases), [rate_table(cases), *map(stage_table, cases)], as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

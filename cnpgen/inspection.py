@@ -1,0 +1,147 @@
+"""What a dataset holds and how it came about, from its plan and the sidecars of its shards; no row is read."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.fields import Field
+from cnpgen.store.documents import plain
+from cnpgen.store.layout import MANIFEST, PLAN
+from cnpgen.store.outcome import Outcome, densities_to_json
+from cnpgen.store.plan import DatasetPlan, load_plan
+from cnpgen.store.statistics import FieldStatistics, merge_statistics
+from cnpgen.store.summary import Summary, summarise
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What is known of a dataset, finished or not.
+
+    Attributes:
+        folder: Its folder.
+        summary: Its plan and the records of its finished shards.
+        sealed: Whether its manifest is there.
+        bytes: Size of its files.
+    """
+
+    folder: Path
+    summary: Summary
+    sealed: bool
+    bytes: int
+
+    @property
+    def plan(self) -> DatasetPlan:
+        """The plan of the dataset."""
+        return self.summary.plan
+
+    @property
+    def outcome(self) -> Outcome:
+        """The fates of all draws that were made for the rows that are there."""
+        return self.summary.outcome
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of it is there."""
+        return self.sealed and not self.summary.problems
+
+    @property
+    def state(self) -> str:
+        """The state of the dataset in a few words."""
+        count = f"{len(self.summary.records)} of {self.summary.n_shards} shards"
+        if self.complete:
+            return "complete"
+        if self.sealed:
+            return f"damaged: {count} are as they were made, 'cnpgen validate' says more"
+        return f"unfinished: {count}, run make-dataset again to go on"
+
+    @cached_property
+    def rows(self) -> dict[str, int]:
+        """Rows per split that are there."""
+        return {split: sum(record.rows for _, record in self.summary.of_split(split)) for split in self.plan.splits}
+
+    @cached_property
+    def statistics(self) -> Mapping[str, FieldStatistics]:
+        """Statistics of every field over all splits; empty without rows."""
+        parts = list(self.summary.statistics.values())
+        return merge_statistics(parts) if parts else {}
+
+    @property
+    def seconds(self) -> float:
+        """Working time of all processes together [s]."""
+        return sum(record.seconds for _, record in self.summary.records)
+
+    @cached_property
+    def environments(self) -> list[dict[str, str]]:
+        """The versions of cnpgen, Python and libraries that made the shards; more than one after an upgrade."""
+        found: list[dict[str, str]] = []
+        for _, record in self.summary.records:
+            if (versions := dict(record.versions)) not in found:
+                found.append(versions)
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything for JSON."""
+        plan = self.plan
+        content = {
+            "folder": self.folder,
+            **{name: getattr(plan, name) for name in ("name", "version", "title", "license")},
+            **{name: getattr(self, name) for name in ("complete", "state", "bytes", "seconds")},
+            "shards": {"planned": self.summary.n_shards, "finished": len(self.summary.records)},
+            "rows": {split: {"planned": plan.splits[split], "stored": rows} for split, rows in self.rows.items()},
+            "fields": [self._field(field) for field in plan.fields],
+            "yield": _yield(self.outcome),
+            "yield_by_split": {split: _yield(outcome) for split, outcome in self.summary.outcomes.items()},
+            "densities": densities_to_json(self.outcome.densities),
+            "verification": self.outcome.verification,
+            "seed": str(plan.seed),
+            **{name: getattr(plan, name) for name in ("generator", "backend", "dtype", "shard_size", "recipe_sha256")},
+            "plan_fingerprint": plan.fingerprint,
+            "versions": plan.versions,
+            "environments": self.environments,
+        }
+        found: dict[str, Any] = plain(content)
+        return found
+
+    def _field(self, field: Field) -> dict[str, Any]:
+        names = ("name", "unit", "long_name", "width", "names", "role", "frame", "dtype", "valid_min", "valid_max")
+        content = {name: getattr(field, name) for name in names}
+        found = self.statistics.get(field.name)
+        if found is None:
+            return content
+        return content | {"min": found.minimum, "mean": found.mean, "max": found.maximum, "std": found.std}
+
+
+def _yield(outcome: Outcome) -> dict[str, Any]:
+    """Return tried, accepted and, in pipeline order, why draws were rejected and how many went on."""
+    tried, left, steps = max(outcome.tried, 1), outcome.tried, []
+    for reason, count in outcome.rejections.items():
+        left -= count
+        steps.append({"reason": reason, "draws": count, "share": count / tried, "left": left / tried})
+    share = outcome.accepted / tried
+    return {"tried": outcome.tried, "accepted": outcome.accepted, "acceptance": share, "rejections": steps}
+
+
+def inspect_dataset(folder: str | Path) -> Inspection:
+    """Look at a dataset, finished or not.
+
+    Args:
+        folder: Its folder.
+
+    Raises:
+        UsageError: There is no such folder.
+        DatasetError: It holds no dataset, or its plan is damaged.
+        MachineError: The system would not let us read something.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UsageError(
+            f"{folder} is {'a file' if folder.exists() else 'not there'}, expected the folder of a dataset"
+        )
+    if not (folder / PLAN).exists():
+        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
+    summary = summarise(folder, load_plan(folder), allow_partial=True)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return Inspection(folder, summary, (folder / MANIFEST).is_file(), size)

@@ -1,0 +1,96 @@
+"""Bounds of the residuals on a grid: the problem's, tightened between the points where nothing else looks."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.constraints.constraint import Condition, Constraint
+from cnpgen.recipes import Problem
+from cnpgen.refine.sqp import Bounds
+from cnpgen.refine.transcription import residual_scale
+
+if TYPE_CHECKING:
+    from cnpgen.verify.world import World
+
+Array = NDArray[np.float64]
+EDGE = 0.05  # phase over which tightening fades in: boundary states may sit on a limit
+
+
+@dataclass(frozen=True)
+class Tightening:
+    """How much smaller than the problem's the bounds are, because residuals overshoot between grid points.
+
+    Attributes:
+        limit: Fraction of acceleration and torque limits.
+        gentle: Fraction of position and velocity limits (boundary velocities sit on the limit).
+        clearance: Distance added to clearances [m].
+        band: Half width of equalities, as a fraction of their tolerance.
+    """
+
+    limit: float
+    gentle: float
+    clearance: float
+    band: float
+
+
+class BoundsTemplate:
+    """The bounds of every motion of a problem on one grid.
+
+    Args:
+        problem: The problem.
+        world: Any world of it: the bounds are read off its conditions.
+        s: Phases of the grid, shape (K,).
+        tightening: How much to tighten.
+    """
+
+    def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
+        pairs = [
+            (constraint, condition) for constraint in problem.constraint for condition in constraint.measured(world)
+        ]
+        tables = [_bounds(constraint, condition, s, tightening) for constraint, condition in pairs]
+        self._s = s
+        self._lower = np.concatenate([low for low, _ in tables], axis=1)
+        self._upper = np.concatenate([high for _, high in tables], axis=1)
+        self._pairs = pairs
+
+    def of(self, start_tip: Array) -> Bounds:
+        """Return the bounds of the motion that starts with the tip at ``start_tip`` [m], shape (3,)."""
+        lower, upper = self._lower, self._upper
+        column = 0
+        for constraint, condition in self._pairs:
+            width = len(condition.g)
+            wider = constraint.funnel(condition, self._s, start_tip)
+            if np.any(wider > 0):
+                scale = _scale(constraint, condition)
+                lower, upper = lower.copy(), upper.copy()
+                lower[:, column : column + width] -= wider[:, None] / scale
+                upper[:, column : column + width] += wider[:, None] / scale
+            column += width
+        return Bounds(lower, upper)
+
+
+def _scale(constraint: Constraint, condition: Condition) -> Array:
+    return residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
+
+
+def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: Tightening) -> tuple[Array, Array]:
+    """Scaled bounds (K, m) of one condition."""
+    scale = _scale(constraint, condition)
+    lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
+    upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
+    if condition.exactness == "limit":
+        fraction = tightening.limit if condition.needs == 2 else tightening.gentle
+        shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / EDGE, 0, 1)[:, None]
+        middle, half = (lower + upper) / 2, (upper - lower) / 2
+        lower, upper = middle - shrink * half, middle + shrink * half
+    elif np.array_equal(condition.lower, condition.upper):
+        band = tightening.band * constraint.tolerance / scale
+        lower, upper = lower - band, upper + band
+    else:
+        inside = tightening.clearance * np.clip(np.minimum(s, 1 - s) / EDGE, 0, 1)[:, None] / scale
+        lower, upper = lower + inside, upper - inside
+    if condition.needs < 2:  # fixed by the boundary conditions
+        lower[s == 1], upper[s == 1] = -np.inf, np.inf
+    return lower, upper

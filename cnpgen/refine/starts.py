@@ -1,0 +1,52 @@
+"""Where the optimiser starts from when there is no plan: straight, bent through a configuration, or smooth."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.boundary import Boundary, anchor_line
+from cnpgen.trajectory.spline import basis
+
+Array = NDArray[np.float64]
+SHORTEST = 0.3  # s: first guess of the duration of motions between neighbouring configurations
+
+
+def straight(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
+    """The line between the boundary control points at a constant rate.
+
+    Returns:
+        ``(interior control points (m, n), rate control points (R,))``.
+    """
+    rate = _constant_rate(boundary, velocity_limit, spec)
+    return anchor_line(boundary, rate[None], spec)[0], rate
+
+
+def through(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec, *, middle: Array) -> tuple[Array, Array]:
+    """The same, bent towards a configuration half way."""
+    interior, rate = straight(boundary, velocity_limit, spec)
+    along = np.linspace(0, 1, len(interior))[:, None]
+    bend = 4 * along * (1 - along)
+    chord = (interior[0] + interior[-1]) / 2
+    return interior + 0.5 * bend * (middle - chord), rate
+
+
+def smooth(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
+    """Control points fitted to the quintic polynomial of the boundary conditions."""
+    rate = _constant_rate(boundary, velocity_limit, spec)
+    duration = 1.0 / rate[0]
+    s = np.linspace(0, 1, 4 * spec.path_control_points)
+    q0, q1 = boundary.start_q[0], boundary.goal_q[0]
+    v0, v1 = boundary.start_dq[0] * duration, boundary.goal_dq[0] * duration
+    a0 = boundary.start_ddq[0] * duration**2
+    constraint = np.array([[1, 1, 1], [3, 4, 5], [6, 12, 20]], float)
+    right = np.stack([q1 - q0 - v0 - a0 / 2, v1 - v0 - a0, -a0])
+    cubic = np.linalg.solve(constraint, right)
+    powers = s[:, None] ** np.arange(6)
+    q = powers @ np.concatenate([[q0, v0, a0 / 2], cubic])
+    control = np.linalg.lstsq(basis(s, spec.path_control_points, spec.degree), q, rcond=None)[0]
+    return control[3 : spec.path_control_points - boundary.fixed_at_goal], rate
+
+
+def _constant_rate(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> Array:
+    duration = max(float(np.max(np.abs(boundary.goal_q - boundary.start_q) / velocity_limit)), SHORTEST)
+    return np.full(spec.rate_control_points, 1.0 / duration)

@@ -1,0 +1,130 @@
+"""What several test modules share: one BLAS thread, prepared pipelines, rounds of draws, one small dataset per recipe."""
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+    os.environ[_variable] = "1"  # before NumPy is imported: its result must not depend on the machine's load
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.kernels.compiled import find_compiler
+from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
+from cnpgen.library import load_dataset_recipe, load_pipeline
+from cnpgen.make import make_dataset
+from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
+from cnpgen.pipelines.stage import Batch
+from cnpgen.recipes import DatasetRecipe, Pipeline
+
+SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
+TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
+TINY_SHARD = 250
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
+
+Prepare = Callable[..., PreparedPipeline]
+
+
+@pytest.fixture(scope="session")
+def fastest() -> Backend:
+    """The fastest backend that works here."""
+    return "compiled" if find_compiler() else "numpy"
+
+
+@pytest.fixture(scope="session")
+def cache_folder() -> Path:
+    """The user's own kernel cache: kernels are compiled once per version of the package, not once per run of the tests."""
+    return default_cache_folder()
+
+
+@pytest.fixture(scope="session")
+def prepare(fastest: Backend, cache_folder: Path) -> Prepare:
+    """Prepare a pipeline, given by name or as a recipe, once per session."""
+
+    @cache
+    def by_name(name: str, backend: Backend, dtype: str) -> PreparedPipeline:
+        return PreparedPipeline(load_pipeline(name), backend=backend, cache_folder=cache_folder, dtype=dtype)
+
+    def prepared(what: str | Pipeline, backend: Backend | None = None, dtype: str = "float64") -> PreparedPipeline:
+        if isinstance(what, str):
+            return by_name(what, backend or fastest, dtype)
+        return PreparedPipeline(what, backend=backend or fastest, cache_folder=cache_folder, dtype=dtype)
+
+    return prepared
+
+
+@pytest.fixture(scope="session")
+def kernels_of(cache_folder: Path) -> Callable[..., KernelLibrary]:
+    """Give the kernel library of a prepared pipeline's problem, for any backend."""
+
+    def library(prepared: PreparedPipeline, backend: Backend) -> KernelLibrary:
+        return replace(prepared.context.kernels, backend=backend)
+
+    return library
+
+
+def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> Batch:
+    """Run one round of draws through the stages, up to and including the first one of class ``until``."""
+    batch, random = Batch(size), random_generator(seed, "train", 0)
+    for stage in prepared.pipeline.stage:
+        stage.prepare(prepared.context)(batch, random)
+        if type(stage).__name__ == until:
+            break
+    return batch
+
+
+def without_stages(pipeline: Pipeline, *kinds: str) -> Pipeline:
+    """Return the pipeline without its stages of some classes."""
+    return replace(pipeline, stage=tuple(stage for stage in pipeline.stage if type(stage).__name__ not in kinds))
+
+
+def tiny_recipe(name: str, **changes: Any) -> DatasetRecipe:
+    """A shipped recipe with few rows: 600 of training, 60 of validation."""
+    return replace(load_dataset_recipe(name), splits={"train": 600, "validation": 60}, **changes)
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Make a small dataset of a shipped recipe, once per session; not to be changed."""
+
+    @cache
+    def made(name: str) -> Path:
+        folder = tmp_path_factory.mktemp("tiny") / name
+        make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1)
+        return folder
+
+    return made
+
+
+@pytest.fixture
+def damaged(tiny: Callable[[str], Path], tmp_path: Path) -> Path:
+    """A copy of a small dataset, to be damaged."""
+    return Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "airhockey-hit"))
+
+
+def columns_of(folder: Path, split: str = "train") -> dict[str, np.ndarray]:
+    """Read all rows of a split."""
+    from cnpgen.store.reader import open_dataset
+
+    return open_dataset(folder, allow_partial=True).read(split)
+
+
+@pytest.fixture
+def fresh_compiler() -> Iterator[None]:
+    """Forget which compiler was found, before and after the test."""
+    from cnpgen.kernels import compiled
+
+    def forget() -> None:
+        compiled.find_compiler.cache_clear()
+        compiled.compiler_version.cache_clear()
+
+    forget()
+    yield
+    forget()

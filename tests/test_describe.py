@@ -1,0 +1,140 @@
+"""Recipes in words: complete, with numbers and units, and readable at 100 columns."""
+
+import json
+
+import pytest
+
+from cnpgen import plugins
+from cnpgen.describe import (
+    WIDTH,
+    describe,
+    describe_kind,
+    describe_pipeline,
+    kind_summary,
+    kind_to_dict,
+    numbers,
+    quantity,
+    recipe_to_dict,
+    table,
+)
+from cnpgen.errors import RecipeError
+from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, load_problem
+from cnpgen.schema import Range
+from cnpgen.store.documents import plain
+
+KINDS = [(group, name) for group in (plugins.STAGES, plugins.CONSTRAINTS) for name in plugins.names(group)]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.15, "m", "0.15 m"),
+        (Range(0.6, 1.3), "m", "[0.6, 1.3] m"),
+        (Range(0.16, 0.16), "m", "0.16 m"),
+        ((Range(0.0, 1.0), Range(2.0, 2.0)), "rad", "[0, 1] x 2 rad"),
+        ((0.2, 0.3), "m", "(0.2, 0.3) m"),
+        ((), "rad", "none"),
+        (None, "m", "none"),
+        ("", "1", "none"),
+        ("base", "1", "base"),
+        (7, "1", "7"),
+        (True, "1", "true"),
+        (0.0, "m", "0 m"),
+    ],
+)
+def test_a_value_is_written_with_its_unit(value, unit, text):
+    assert quantity(value, unit) == text
+
+
+def test_the_numbers_of_a_constraint_have_units():
+    constraints = {type(item).__name__: item for item in load_problem("airhockey").constraint}
+    text = numbers(constraints["Table"])
+    for part in ("x [0.6, 2] m", "y [-0.45, 0.45] m", "z 0.16 m", "start_band 0.005 m", "tolerance 0.001 m"):
+        assert part in text
+
+
+@pytest.mark.parametrize("name", list(list_recipes("dataset")))
+def test_a_dataset_is_described_with_everything_it_refers_to(name):
+    recipe = load_dataset_recipe(name)
+    text = describe(recipe)
+    assert f"dataset {name} {recipe.version}" in text
+    assert f"pipeline {recipe.pipeline.name}" in text
+    assert f"problem {recipe.pipeline.problem.name}" in text
+    assert str(recipe.seed) in text
+    for joint in recipe.pipeline.problem.robot.joints:
+        assert joint in text
+    long = [line for line in text.splitlines() if len(line) > WIDTH]
+    assert not [line for line in long if str(recipe.path) not in line]
+
+
+def test_the_stages_are_numbered_in_order():
+    lines = describe_pipeline(load_pipeline("airhockey-hit")).splitlines()
+    heads = [line.split()[:2] for line in lines if line.split()[0].endswith(".") and line.startswith("  ")]
+    names = [use for _, use in heads]
+    assert [number for number, _ in heads] == [f"{index}." for index in range(1, len(heads) + 1)]
+    assert names[:2] == ["draw-positions", "start-ik"]
+    assert names[-1] == "ballistic-reach"
+
+
+def test_the_limits_of_every_joint_are_shown():
+    text = describe(load_problem("airhockey"))
+    assert "velocity [rad/s]" in text
+    assert "-2.967 to 2.967" in text
+    assert "11.87" in text
+
+
+def test_an_object_and_obstacles_are_described():
+    text = describe(load_problem("heavy-object"))
+    assert "(0.2, 0.2, 0.3) m" in text
+    assert "pedestal-2: x [0.2, 0.6] m" in text
+
+
+@pytest.mark.parametrize("kind", ["problem", "pipeline", "dataset"])
+def test_every_kind_of_recipe_has_a_json_form(kind):
+    load = {"problem": load_problem, "pipeline": load_pipeline, "dataset": load_dataset_recipe}[kind]
+    content = json.loads(json.dumps(plain(recipe_to_dict(load("heavy-object")))))
+    assert content["kind"] == kind
+    assert len(content["limits"]["velocity_limit"]["values"]) == len(content["joints"]) == 7
+    assert ("stages" in content) == (kind != "problem")
+
+
+@pytest.mark.parametrize(("group", "name"), KINDS)
+def test_every_kind_of_stage_and_constraint_is_described(group, name):
+    text, content = describe_kind(group, name), json.loads(json.dumps(plain(kind_to_dict(group, name))))
+    assert name in text.splitlines()[0]
+    assert content["summary"]
+    for key in content["keys"]:
+        assert key["name"] in text
+        assert key["doc"]
+        assert key["required"] == ("default" not in key)
+    assert all(len(line) <= WIDTH for line in text.splitlines())
+
+
+def test_an_unknown_kind_is_refused_with_the_nearest_one():
+    with pytest.raises(RecipeError, match="did you mean 'start-ik'"):
+        describe_kind(plugins.STAGES, "start-ikk")
+
+
+def test_a_summary_is_the_first_line_without_markup():
+    class Kind:
+        """Do ``this``.
+
+        And that.
+        """
+
+    assert kind_summary(Kind) == "Do this."
+    assert kind_summary(type("Bare", (), {})) == ""
+
+
+def test_a_table_is_aligned_and_its_last_column_wraps():
+    lines = table([("a", "1", "short"), ("long", "20", "word " * 40)], indent="  ", right=(1,))
+    assert lines[0] == "  a      1  short"
+    assert lines[1].startswith("  long  20  word word")
+    assert lines[2].startswith(" " * 12 + "word")
+    assert all(len(line) <= WIDTH for line in lines)
+
+
+def test_a_table_can_cut_its_last_column_instead():
+    (line,) = table([("name", "word " * 40)], one_line=True)
+    assert len(line) <= WIDTH
+    assert line.endswith(" ...")

@@ -1,0 +1,102 @@
+"""Every block in the README and the docs runs as it is shown."""
+
+import configparser
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
+RUNNABLE = {"bash", "python", "toml"}
+
+
+def blocks(page: Path) -> list[tuple[dict[str, str], str, str]]:
+    """Return (markers, language, text) of the fenced blocks of a page."""
+    found = []
+    for marks, language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
+        pairs = re.findall(r"<!-- (\w+)(?:: (\S+))? -->", marks)
+        found.append((dict(pairs), language, text))
+    return found
+
+
+def environment(folder: Path) -> dict[str, str]:
+    binaries = Path(sys.executable).parent
+    paths = [str(folder / "src"), os.environ.get("PYTHONPATH", "")]
+    return {
+        **os.environ,
+        "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": os.pathsep.join(path for path in paths if path),
+        "MPLBACKEND": "Agg",
+    }
+
+
+def run(command: list[str], folder: Path) -> str:
+    done = subprocess.run(command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_every_block_says_what_it_is() -> None:
+    for page in PAGES:
+        for marks, language, text in blocks(page):
+            assert language in RUNNABLE | {""}, f"{page.name}: a block of language {language!r} cannot be run: {text[:60]}"
+            assert language != "toml" or "file" in marks, f"{page.name}: a TOML block must be a file: {text[:60]}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_blocks_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
+    for marks, language, text in blocks(page):
+        if "needs" in marks and not (tmp_path / marks["needs"]).exists():
+            out = ["--n", "400", "--workers", "1", "--out", marks["needs"]]
+            run([sys.executable, "-m", "cnpgen", "make-dataset", "airhockey-hit", *out], tmp_path)
+        if "install" in marks or "test" in marks:
+            continue  # .ci/run runs these two in fresh environments
+        if "file" in marks:
+            path = tmp_path / marks["file"]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        elif language == "bash":
+            run(["bash", "-euo", "pipefail", "-c", text], tmp_path)
+        elif language == "python":
+            run([sys.executable, "-c", text], tmp_path)
+
+
+def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
+    files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
+    source = tmp_path / "src"
+    source.mkdir()
+    (source / "my_hockey.py").write_text(files["src/my_hockey.py"], encoding="utf-8")
+    install(source, tomllib.loads(files["pyproject.toml"])["project"])
+    shipped = ROOT / "problems" / "airhockey"
+    problem = (shipped / "problem.toml").read_text(encoding="utf-8")
+    problem = problem.replace('urdf = "', f'urdf = "{shipped}/')
+    problem += '\n[[constraint]]\nuse = "keep-out"\nx = "1.0 m"\ny = "0 m"\nradius = "10 cm"\ntolerance = "1 mm"\n'
+    pipeline = (ROOT / "pipelines" / "airhockey-hit.toml").read_text(encoding="utf-8")
+    pipeline = pipeline.replace('problem = "airhockey"', 'problem = "./problem.toml"')
+    pipeline += '\n[[stage]]\nuse = "slow-hits"\nmax_speed = "1 m/s"\n'
+    (tmp_path / "problem.toml").write_text(problem, encoding="utf-8")
+    (tmp_path / "slow.toml").write_text(pipeline, encoding="utf-8")
+
+    assert "slow-hits" in run(["cnpgen", "list"], tmp_path)
+    run(["cnpgen", "make-dataset", "slow.toml", "--n", "300", "--workers", "1", "--out", "slow"], tmp_path)
+    run(["cnpgen", "validate", "slow", "--deep", "--workers", "1"], tmp_path)
+    rejected = run(["cnpgen", "inspect", "slow"], tmp_path)
+    assert "hit too fast" in rejected
+    assert "in the circle" in rejected
+
+
+def install(folder: Path, project: dict[str, object]) -> None:
+    """Do what pip does for entry points: write the metadata beside the module."""
+    info = folder / f"{str(project['name']).replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    entry_points = configparser.ConfigParser(delimiters=("=",))
+    entry_points.read_dict(project["entry-points"])  # type: ignore[arg-type]
+    with (info / "entry_points.txt").open("w", encoding="utf-8") as file:
+        entry_points.write(file)

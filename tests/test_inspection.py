@@ -1,0 +1,152 @@
+"""Inspection: what the plan and the sidecars say is what the rows say, of whole and of unfinished datasets."""
+
+import builtins
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.inspection import inspect_dataset
+from cnpgen.make import make_dataset
+from cnpgen.plots import plot_dataset
+from cnpgen.store.outcome import DensityMap, Outcome
+from cnpgen.store.reader import open_dataset
+
+
+@pytest.fixture(scope="session")
+def hits(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inspection") / "hits"
+    make_dataset("airhockey-hit", folder, n=200, workers=1)
+    return folder
+
+
+@pytest.fixture
+def unfinished(hits, tmp_path):
+    folder = tmp_path / "unfinished"
+    shutil.copytree(hits, folder)
+    (folder / "manifest.json").unlink()
+    (folder / "validation" / "shard-00000.json").unlink()
+    return folder
+
+
+def test_rows_and_state_of_a_complete_dataset(hits):
+    found = inspect_dataset(str(hits))
+    assert found.complete
+    assert found.state == "complete"
+    assert found.rows == {"train": 182, "validation": 18}
+    assert found.bytes == sum(path.stat().st_size for path in hits.rglob("*") if path.is_file())
+    assert found.seconds > 0
+
+
+def test_statistics_are_those_of_the_rows(hits):
+    found, dataset = inspect_dataset(hits), open_dataset(hits)
+    rows = np.concatenate([dataset.read(split)["goal_q"] for split in ("train", "validation")])
+    np.testing.assert_array_equal(found.statistics["goal_q"].minimum, rows.min(axis=0))
+    np.testing.assert_allclose(found.statistics["goal_q"].mean, rows.mean(axis=0), rtol=1e-12)
+
+
+def test_the_inspection_is_frozen(hits):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        inspect_dataset(hits).bytes = 0
+
+
+def test_the_json_form_has_everything(hits):
+    found = inspect_dataset(hits)
+    content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert content["complete"] is True
+    assert content["rows"]["train"] == {"planned": 182, "stored": 182}
+    assert [item["name"] for item in content["fields"]] == [field.name for field in found.plan.fields]
+    assert len(content["fields"][0]["mean"]) == 6
+    assert content["seed"] == str(found.plan.seed)
+    assert content["environments"][0]["numpy"] == np.__version__
+    density = content["densities"]["goal_xyz"]
+    assert np.sum(density["drawn"]) == content["yield"]["tried"]
+    assert np.sum(density["accepted"]) == content["yield"]["accepted"] == 200
+
+
+def test_the_yield_goes_down_to_the_acceptance_in_pipeline_order(hits):
+    found = inspect_dataset(hits).to_dict()["yield"]
+    left = [1.0, *(step["left"] for step in found["rejections"])]
+    assert left == sorted(left, reverse=True)
+    assert left[-1] == pytest.approx(found["acceptance"])
+    assert found["rejections"][0]["reason"] == "too close together"
+
+
+def test_an_unfinished_dataset_is_inspected_and_says_so(unfinished):
+    found = inspect_dataset(unfinished)
+    assert not found.complete
+    assert found.state.startswith("unfinished: 1 of 2 shards")
+    assert found.rows == {"train": 182, "validation": 0}
+    assert found.to_dict()["rows"]["validation"] == {"planned": 18, "stored": 0}
+
+
+def test_a_dataset_without_any_shard_has_no_statistics(unfinished):
+    (unfinished / "train" / "shard-00000.json").unlink()
+    found = inspect_dataset(unfinished)
+    assert found.statistics == {}
+    assert "min" not in found.to_dict()["fields"][0]
+    assert found.to_dict()["yield"]["acceptance"] == 0
+
+
+def test_a_complete_dataset_that_lost_a_shard_is_damaged(hits, tmp_path):
+    shutil.copytree(hits, tmp_path / "damaged")
+    (tmp_path / "damaged" / "train" / "shard-00000.h5").unlink()
+    found = inspect_dataset(tmp_path / "damaged")
+    assert not found.complete
+    assert found.state.startswith("damaged: 1 of 2 shards")
+
+
+def test_what_is_no_dataset_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="not there"):
+        inspect_dataset(tmp_path / "nothing")
+    with pytest.raises(DatasetError, match="not a dataset of cnpgen"):
+        inspect_dataset(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="a file"):
+        inspect_dataset(tmp_path / "file")
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_a_dataset_is_drawn(hits, tmp_path, suffix):
+    plot_dataset(inspect_dataset(hits), tmp_path / f"hits.{suffix}")
+    assert (tmp_path / f"hits.{suffix}").stat().st_size > 10_000
+
+
+def test_an_unfinished_dataset_is_drawn(unfinished, tmp_path):
+    plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
+    assert (tmp_path / "hits.png").exists()
+
+
+def test_a_density_map_over_a_single_point_is_drawn(hits, tmp_path, monkeypatch):
+    found = inspect_dataset(hits)
+    density = DensityMap((0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64))
+    monkeypatch.setitem(vars(found.summary), "outcome", Outcome(tried=0, accepted=0, densities={"start_xyz": density}))
+    plot_dataset(found, tmp_path / "point.png")
+    assert (tmp_path / "point.png").exists()
+
+
+def test_nothing_to_draw_is_said(unfinished, tmp_path):
+    (unfinished / "train" / "shard-00000.json").unlink()
+    with pytest.raises(DatasetError, match="no rows yet"):
+        plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
+
+
+def test_missing_matplotlib_is_a_hint_and_not_a_traceback(hits, tmp_path, monkeypatch):
+    original = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name.startswith("matplotlib"):
+            raise ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib")
+        return original(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MachineError, match=r"cnpgen\[plot\]"):
+        plot_dataset(inspect_dataset(hits), tmp_path / "hits.png")
+
+
+def test_a_picture_that_cannot_be_written_is_a_machine_error(hits, tmp_path):
+    with pytest.raises(MachineError, match="cannot write"):
+        plot_dataset(inspect_dataset(hits), tmp_path / "no" / "such" / "folder.png")

@@ -1,0 +1,554 @@
+"""The judge: right rows pass, and every kind of corruption is found under its name, in its row and in no other."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.constraints.constraint import Condition, Constraint
+from cnpgen.errors import DatasetError, RecipeError
+from cnpgen.library import load_problem
+from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.verify import rows as rows_module
+from cnpgen.verify.report import Check, RowReport, merge
+from cnpgen.verify.rows import verify_rows
+from cnpgen.verify.scene import Scene
+from cnpgen.verify.world import World, obstacle_tops
+
+Columns = dict[str, np.ndarray]
+AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
+ROWS = 6
+WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+# --- right rows, made with Pinocchio and NumPy ------------------------------------------------------------------------
+
+
+def jacobian(robot: Robot, q: np.ndarray) -> np.ndarray:
+    frame = robot.model.getFrameId(robot.tip)
+    return pin.computeFrameJacobian(robot.model, robot.model.createData(), q, frame, WORLD_ALIGNED)
+
+
+def tip_pose(robot: Robot, q: np.ndarray) -> pin.SE3:
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, q)
+    return data.oMf[robot.model.getFrameId(robot.tip)]
+
+
+def inverse_kinematics(robot: Robot, q: np.ndarray, xyz: np.ndarray, *, upright: bool) -> np.ndarray | None:
+    """Newton's method for the tip position and, if asked, a vertical z axis; None outside the joint limits."""
+    for _ in range(60):
+        pose, J = tip_pose(robot, q), jacobian(robot, q)
+        error, rows = xyz - pose.translation, J[:3]
+        if upright:
+            tilt = np.cross(pose.rotation[:, 2], [0, 0, 1])
+            error, rows = np.append(error, tilt[:2]), J[:5]
+        q = q + np.clip(np.linalg.pinv(rows) @ error, -0.3, 0.3)
+    inside = np.all((robot.position_lower < q) & (q < robot.position_upper))
+    return q if inside and np.linalg.norm(error) < 1e-12 and tip_pose(robot, q).rotation[2, 2] * upright >= 0 else None
+
+
+def sliding_acceleration(robot: Robot, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+    """The smallest ddq that keeps the tip at its height."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q, dq, np.zeros(robot.n))
+    frame = robot.model.getFrameId(robot.tip)
+    bias = pin.getFrameClassicalAcceleration(robot.model, data, frame, WORLD_ALIGNED).linear[2]
+    gain = jacobian(robot, q)[2]
+    return -gain * bias / (gain @ gain)
+
+
+def hit_row(robot: Robot, random: np.random.Generator, *, share: float) -> Columns:
+    """A motion that starts somewhere near the table and hits with a share of the speed that the joints allow."""
+    start_xyz = np.array([random.uniform(0.7, 0.9), random.uniform(-0.2, 0.2), 0.16 + random.uniform(-4e-3, 4e-3)])
+    goal_xyz = np.array([random.uniform(0.8, 1.0), random.uniform(-0.2, 0.2), 0.16])
+    start_q, goal_q = (inverse_kinematics(robot, robot.base, xyz, upright=False) for xyz in (start_xyz, goal_xyz))
+    gain = jacobian(robot, start_q)[2]
+    start_dq = random.uniform(-1, 1, robot.n)
+    start_dq -= gain * (gain @ start_dq) / (gain @ gain)
+    start_dq *= 0.3 * (robot.velocity_limit / np.abs(start_dq)).min()
+    angle = random.uniform(-0.5, 0.5)
+    goal_dq = np.linalg.pinv(jacobian(robot, goal_q)[:3]) @ np.array([np.cos(angle), np.sin(angle), 0.0])
+    speed = share * (robot.velocity_limit / np.abs(goal_dq)).min()
+    return {
+        "start_q": start_q,
+        "start_dq": start_dq,
+        "start_ddq": sliding_acceleration(robot, start_q, start_dq),
+        "goal_q": goal_q,
+        "goal_dq": speed * goal_dq,
+        "start_xyz": start_xyz,
+        "goal_xyz": goal_xyz,
+        "hit_angle": np.array(angle),
+        "hit_speed": np.array(speed),
+    }
+
+
+def carry_row(robot: Robot, random: np.random.Generator) -> Columns:
+    """A motion from rest over the first pedestal to rest over the second, clear of both."""
+    row = {name: np.zeros(7) for name in ("start_dq", "start_ddq", "goal_dq")}
+    for end, side in (("start", -1), ("goal", 1)):
+        row[f"{end}_xyz"] = np.array([random.uniform(0.45, 0.55), side * random.uniform(0.35, 0.5), 0.4])
+        row[f"{end}_xyz"][2] += random.uniform(-0.1, 0.1)
+    for end in ("start", "goal"):
+        q = None
+        while q is None or not (is_clear(robot, q, row) and holds(robot, q)):
+            q = inverse_kinematics(robot, random.uniform(-1.5, 1.5, 7), row[f"{end}_xyz"], upright=True)
+        row[f"{end}_q"] = q
+    return row
+
+
+def is_clear(robot: Robot, q: np.ndarray, row: Columns) -> bool:
+    """Whether points along the arm, 1 mm apart, are 0.145 m from both pedestals."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    corners = np.array([*(data.oMi[i].translation for i in (2, 4, 6)), tip_pose(robot, q).translation])
+    points = np.concatenate([np.linspace(a, b, 500) for a, b in pairwise(corners)])
+    for box, end in zip(HEAVY.obstacle, ("start", "goal"), strict=True):
+        low = np.array([box.x.low, box.y.low, -9.0])
+        high = np.array([box.x.high, box.y.high, row[f"{end}_xyz"][2] - 0.15])
+        if np.linalg.norm(points - np.clip(points, low, high), axis=1).min() < 0.145:
+            return False
+    return True
+
+
+def holds(robot: Robot, q: np.ndarray) -> bool:
+    torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+    return bool(np.all(np.abs(torque) < robot.torque_limit))
+
+
+@dataclass(frozen=True)
+class Case:
+    robot: Robot
+    columns: Columns
+
+    def copy(self) -> Columns:
+        return {name: column.copy() for name, column in self.columns.items()}
+
+
+@pytest.fixture(scope="module")
+def hits() -> Case:
+    """The last row is at its velocity limit, the first one ends at rest."""
+    robot, random = load_robot(AIRHOCKEY), np.random.default_rng(7)
+    made = [hit_row(robot, random, share=share) for share in (0.0, 0.2, 0.5, 0.7, 0.9, 1.0)]
+    return Case(robot, {name: np.array([row[name] for row in made]) for name in made[0]})
+
+
+@pytest.fixture(scope="module")
+def carries() -> Case:
+    robot, random = load_robot(HEAVY), np.random.default_rng(8)
+    made = [carry_row(robot, random) for _ in range(ROWS)]
+    return Case(robot, {name: np.array([row[name] for row in made]) for name in made[0]})
+
+
+def failures(report: RowReport) -> set[str]:
+    return {check.name for check in report.failed}
+
+
+def test_right_hits_pass(hits):
+    report = verify_rows(AIRHOCKEY, hits.robot, hits.columns)
+    assert failures(report) == set()
+    assert report.ok
+    assert report.rows == ROWS
+    assert [check.name for check in report.checks] == [
+        "finite",
+        "tip position",
+        "joint position",
+        "joint velocity",
+        "joint acceleration",
+        "joint torque",
+        "table rectangle",
+        "table height",
+        "vertical velocity",
+        "vertical acceleration",
+        "hit direction",
+        "hit speed",
+    ]
+
+
+def test_right_carries_pass(carries):
+    report = verify_rows(HEAVY, carries.robot, carries.columns)
+    assert failures(report) == set()
+    assert {"tilt", "upright", "robot clearance", "object contact"} <= {check.name for check in report.checks}
+
+
+def test_right_rows_stored_in_single_precision_pass_as_such_only(hits):
+    single = {name: column.astype(np.float32) for name, column in hits.columns.items()}
+    limit = hits.robot.velocity_limit.astype(np.float32).astype(float)
+    single["goal_dq"] = np.where(np.abs(single["goal_dq"]) >= limit, single["goal_dq"] * (1 - 1e-7), single["goal_dq"])
+    assert verify_rows(AIRHOCKEY, hits.robot, single, "float32").ok
+    assert failures(verify_rows(AIRHOCKEY, hits.robot, single)) >= {"tip position", "hit direction"}
+
+
+# --- corrupted rows ---------------------------------------------------------------------------------------------------
+
+
+def lift(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Joint velocities that lift the tip at 1 m/s."""
+    return np.linalg.pinv(jacobian(robot, q)[:3])[:, 2]
+
+
+def move_start(case: Case, columns: Columns, row: int) -> None:
+    columns["start_q"][row, 1] += 1e-6
+
+
+def move_goal(case: Case, columns: Columns, row: int) -> None:
+    columns["goal_q"][row, 3] -= 1e-6
+
+
+def claim_another_place(case: Case, columns: Columns, row: int) -> None:
+    columns["goal_xyz"][row, 1] += 1e-6
+
+
+def leave_joint_limits(case: Case, columns: Columns, row: int) -> None:
+    columns["start_q"][row, 0] = case.robot.position_upper[0] + 1e-6
+
+
+def exceed_velocity(case: Case, columns: Columns, row: int) -> None:
+    factor = (1 + 1e-9) / np.max(np.abs(columns["goal_dq"][row]) / case.robot.velocity_limit)
+    for name in ("goal_dq", "hit_speed"):
+        columns[name][row] *= factor
+
+
+def exceed_acceleration(case: Case, columns: Columns, row: int) -> None:
+    gain = jacobian(case.robot, columns["start_q"][row])[2]
+    level = np.eye(6)[5] - gain * gain[5] / (gain @ gain)
+    columns["start_ddq"][row] += level * 21.0 / level[5]
+
+
+def turn_hit(case: Case, columns: Columns, row: int) -> None:
+    columns["hit_angle"][row] += 1e-6
+
+
+def claim_another_speed(case: Case, columns: Columns, row: int) -> None:
+    columns["hit_speed"][row] -= 1e-6
+
+
+def hit_backwards(case: Case, columns: Columns, row: int) -> None:
+    columns["hit_angle"][row] += np.pi
+
+
+def rise(case: Case, columns: Columns, row: int) -> None:
+    columns["goal_dq"][row] += 1e-6 * lift(case.robot, columns["goal_q"][row])
+
+
+def rise_faster(case: Case, columns: Columns, row: int) -> None:
+    columns["start_ddq"][row] += 1e-6 * lift(case.robot, columns["start_q"][row])
+
+
+def leave_table(case: Case, columns: Columns, row: int) -> None:
+    xyz = np.array([0.6 - 1e-5, 0.0, 0.16])
+    columns["start_q"][row] = inverse_kinematics(case.robot, case.robot.base, xyz, upright=False)
+    columns["start_xyz"][row], columns["start_dq"][row], columns["start_ddq"][row] = xyz, 0.0, 0.0
+
+
+def put_nan(case: Case, columns: Columns, row: int) -> None:
+    columns["start_ddq"][row, 2] = np.nan
+
+
+def put_infinity(case: Case, columns: Columns, row: int) -> None:
+    columns["hit_speed"][row] = np.inf
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "names"),
+    [
+        (claim_another_place, {"tip position"}),
+        (exceed_velocity, {"joint velocity"}),
+        (exceed_acceleration, {"joint acceleration"}),
+        (turn_hit, {"hit direction"}),
+        (claim_another_speed, {"hit speed"}),
+        (hit_backwards, {"hit direction", "hit speed"}),
+        (rise, {"vertical velocity"}),
+        (rise_faster, {"vertical acceleration"}),
+        (leave_table, {"table rectangle"}),
+        (put_nan, {"finite"}),
+        (put_infinity, {"finite"}),
+    ],
+)
+@pytest.mark.parametrize("row", [1, ROWS - 1])
+def test_corruption_of_a_hit_is_found_under_its_name_in_its_row(hits, corrupt, names, row):
+    columns = hits.copy()
+    corrupt(hits, columns, row)
+    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    assert failures(report) == names
+    assert report.out.tolist() == [row]
+    assert all((check.rows_out, check.worst_row) == (1, row) for check in report.failed)
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "names"),
+    [
+        (move_start, {"tip position"}),
+        (move_goal, {"tip position", "table height"}),
+        (leave_joint_limits, {"joint position", "tip position"}),
+    ],
+)
+def test_moved_joints_are_found_among_what_follows_from_them(hits, corrupt, names):
+    columns = hits.copy()
+    corrupt(hits, columns, 3)
+    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    assert failures(report) >= names
+    assert report.out.tolist() == [3]
+
+
+def tilt(case: Case, columns: Columns, row: int) -> None:
+    turn = np.linalg.pinv(jacobian(case.robot, columns["goal_q"][row]))[:, 3]
+    columns["goal_q"][row] += 1e-6 * turn
+
+
+def sink_into_pedestal(case: Case, columns: Columns, row: int) -> None:
+    columns["start_xyz"][row, 2] += 2e-3
+
+
+def reach_through_pedestal(case: Case, columns: Columns, row: int) -> None:
+    columns["start_q"][row] = [np.pi / 4, np.pi / 2, 0, 0, 0, 0, 0]
+    columns["start_xyz"][row] = tip_pose(case.robot, columns["start_q"][row]).translation
+    columns["goal_xyz"][row, 2] = 0.8
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "names"),
+    [
+        (tilt, {"tilt"}),
+        (sink_into_pedestal, {"tip position", "object contact"}),
+        (put_nan, {"finite"}),
+    ],
+)
+def test_corruption_of_a_carry_is_found_under_its_name_in_its_row(carries, corrupt, names):
+    columns = carries.copy()
+    corrupt(carries, columns, 2)
+    report = verify_rows(HEAVY, carries.robot, columns)
+    assert failures(report) == names
+    assert report.out.tolist() == [2]
+
+
+def test_arm_in_a_pedestal_is_found(carries):
+    columns = carries.copy()
+    reach_through_pedestal(carries, columns, 4)
+    report = verify_rows(HEAVY, carries.robot, columns)
+    assert failures(report) >= {"robot clearance"}
+    assert report.out.tolist() == [4]
+    (clearance,) = (check for check in report.checks if check.name == "robot clearance")
+    assert (clearance.worst, clearance.worst_row, clearance.worst_end) == (pytest.approx(0.14), 4, "start")
+
+
+# --- torque, and what is known of the goal ----------------------------------------------------------------------------
+
+
+def with_torque_limit(robot: Robot, joint: int, limit: float) -> Robot:
+    return replace(robot, torque_limit=np.where(np.arange(robot.n) == joint, limit, robot.torque_limit))
+
+
+def holding_torque(case: Case, end: str, joint: int) -> np.ndarray:
+    model = case.robot.model
+    torques = [pin.computeGeneralizedGravity(model, model.createData(), q)[joint] for q in case.columns[f"{end}_q"]]
+    return np.abs(torques)
+
+
+@pytest.mark.parametrize(("end", "other"), [("start", "goal"), ("goal", "start")])
+def test_holding_torque_is_checked_at_both_ends_that_rest(carries, end, other):
+    excess = [holding_torque(carries, end, j).max() - holding_torque(carries, other, j).max() for j in range(7)]
+    joint = int(np.argmax(excess))
+    torque = holding_torque(carries, end, joint)
+    report = verify_rows(HEAVY, with_torque_limit(carries.robot, joint, torque.max() * (1 - 1e-9)), carries.columns)
+    (check,) = report.failed
+    assert (check.name, check.worst_end, check.worst_row) == ("joint torque", end, int(torque.argmax()))
+    assert check.worst == pytest.approx(1e-9 * torque.max(), rel=1e-3)
+    assert report.out.tolist() == [torque.argmax()]
+
+
+def test_torque_at_a_goal_that_moves_is_checked_only_if_its_acceleration_is_stored(hits):
+    columns = hits.copy()
+    columns["goal_ddq"] = np.array(
+        [sliding_acceleration(hits.robot, *pair) for pair in zip(columns["goal_q"], columns["goal_dq"], strict=True)]
+    )
+    assert verify_rows(AIRHOCKEY, hits.robot, columns).ok
+    columns["goal_ddq"][4] += 1e-6 * lift(hits.robot, columns["goal_q"][4])
+    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    assert (failures(report), report.out.tolist()) == ({"vertical acceleration"}, [4])
+    strict = with_torque_limit(hits.robot, 1, 1.0)
+    del columns["goal_ddq"]
+    columns["start_q"], columns["start_xyz"] = columns["goal_q"], columns["goal_xyz"]
+    columns["start_dq"], columns["start_ddq"] = 0 * columns["start_dq"], 0 * columns["start_ddq"]
+    torque = next(c for c in verify_rows(AIRHOCKEY, strict, columns).checks if c.name == "joint torque")
+    assert torque.rows_out == ROWS
+
+
+# --- reports ----------------------------------------------------------------------------------------------------------
+
+
+def test_blocks_do_not_change_the_report(hits, monkeypatch):
+    columns = hits.copy()
+    turn_hit(hits, columns, 1)
+    rise(hits, columns, 4)
+    put_nan(hits, columns, 3)
+    whole = verify_rows(AIRHOCKEY, hits.robot, columns)
+    monkeypatch.setattr(rows_module, "BLOCK", 2)
+    blocks = verify_rows(AIRHOCKEY, hits.robot, columns)
+    assert whole.to_dict() == blocks.to_dict()
+    assert whole.out.tolist() == [1, 3, 4]
+
+
+def test_merged_reports_are_the_report_of_all_rows(hits):
+    columns = hits.copy()
+    rise(hits, columns, 4)
+    parts = [{name: column[part] for name, column in columns.items()} for part in (slice(0, 4), slice(4, 6))]
+    merged = merge([verify_rows(AIRHOCKEY, hits.robot, part) for part in parts])
+    assert merged.to_dict() == verify_rows(AIRHOCKEY, hits.robot, columns).to_dict()
+
+
+def test_no_rows_give_an_empty_report(hits):
+    report = verify_rows(AIRHOCKEY, hits.robot, {name: column[:0] for name, column in hits.columns.items()})
+    assert (report.rows, report.ok, failures(report)) == (0, True, set())
+    assert merge([]).ok
+    assert merge([report, verify_rows(AIRHOCKEY, hits.robot, hits.columns)]).rows == ROWS
+
+
+def test_report_is_valid_json_even_where_something_could_not_be_evaluated():
+    check = Check("torque", "N m", np.inf, 1e-9, 1, 0, "start")
+    text = json.dumps(RowReport(1, (check,), np.array([0])).to_dict(), allow_nan=False)
+    assert json.loads(text)["checks"][0] == {
+        "name": "torque",
+        "unit": "N m",
+        "worst": None,
+        "allowed": 1e-9,
+        "rows_out": 1,
+        "worst_row": 0,
+        "worst_end": "start",
+    }
+
+
+def test_finite_numbers_too_large_to_compute_with_are_out(hits):
+    columns = hits.copy()
+    columns["start_dq"][2] = 1e300
+    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    assert {"joint velocity", "joint torque"} <= failures(report)
+    assert report.out.tolist() == [2]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda columns: columns.pop("goal_dq"), "the rows have no field goal_dq"),
+        (lambda columns: columns.update(start_q=columns["start_q"][:, :5]), r"start_q must have shape \(6, 6\)"),
+        (lambda columns: columns.update(hit_angle=columns["hit_angle"][1:]), r"hit_angle must have shape"),
+        (lambda columns: columns.update(goal_xyz=columns["goal_xyz"][:, :2]), r"goal_xyz must have shape \(6, 3\)"),
+    ],
+)
+def test_rows_of_another_shape_are_refused(hits, change: Callable[[Columns], None], message):
+    columns = hits.copy()
+    change(columns)
+    with pytest.raises(DatasetError, match=message):
+        verify_rows(AIRHOCKEY, hits.robot, columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HighElbow(Constraint):
+    """A constraint that cnpgen does not know."""
+
+    reason = "elbow too low"
+    tolerance: float = 0.0
+    height: float
+
+    def symbolic(self, state):
+        raise NotImplementedError
+
+    def measured(self, world):
+        return ()
+
+    def measured_at(self, world, end):
+        if end == "start":
+            return ()
+        return (Condition("elbow", "rad", [float(world.q[1])], np.array([-9.0]), np.array([self.height]), "angle"),)
+
+
+def test_constraint_of_a_plug_in_is_judged(hits):
+    angles = hits.columns["goal_q"][:, 1]
+    problem = replace(AIRHOCKEY, constraint=(*AIRHOCKEY.constraint, HighElbow(height=float(np.sort(angles)[-2]))))
+    report = verify_rows(problem, hits.robot, hits.columns)
+    (check,) = report.failed
+    assert (check.name, check.rows_out, check.worst_end) == ("elbow", 1, "goal")
+    assert report.out.tolist() == [angles.argmax()]
+
+
+# --- the world --------------------------------------------------------------------------------------------------------
+
+
+def test_tops_follow_the_object_or_are_fixed():
+    high = replace(HEAVY.obstacle[1], top=0.7, below="")
+    problem = replace(HEAVY, obstacle=(HEAVY.obstacle[0], high, HEAVY.obstacle[1]))
+    tops = obstacle_tops(problem, np.array([[0.4, -0.4, 0.5], [0.4, -0.4, 0.6]]), np.array([[0.4, 0.4, 0.3]] * 2))
+    np.testing.assert_allclose(tops, [[0.35, 0.7, 0.15], [0.45, 0.7, 0.15]])
+    np.testing.assert_allclose(obstacle_tops(problem, np.array([0, 0, 0.5]), np.array([0, 0, 0.3])), tops[0])
+
+
+def test_scene_measures_segments_in_order_and_exactly():
+    scene = Scene(HEAVY.obstacle, None, 3)
+    scene.set_tops([0.5, 0.4])
+    up = ((0.4, -0.45, 0.6), (0.4, -0.45, 0.9))  # over the first, 0.75 m beside the second
+    across = ((0.4, -0.2, 0.2), (0.4, 0.2, 0.2))  # 0.1 m from both
+    inside = ((0.3, -0.4, 0.3), (0.5, 0.4, 0.1))
+    beside = np.hypot(0.75, 0.2)
+    expected = [0.1, beside, 0.1, 0.1, 0.0, 0.0]
+    np.testing.assert_allclose(scene.segment_distances([up, across, inside]), expected, atol=1e-9)
+
+
+def test_scene_measures_a_segment_of_no_length():
+    scene = Scene(HEAVY.obstacle, None, 1)
+    scene.set_tops([0.5, 0.4])
+    np.testing.assert_allclose(scene.segment_distances([((0.4, 0.0, 0.2),) * 2]), [0.3, 0.3], atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 2])
+@pytest.mark.parametrize("depth", [-0.1, -1e-9, 0.0, 1e-9, 1e-3, 0.1])
+def test_scene_measures_how_deep_an_object_enters(turn, depth):
+    scene = Scene(HEAVY.obstacle, (0.2, 0.2, 0.3), 0)
+    scene.set_tops([0.5, -3.0])
+    position, rotation = np.array([0.41, -0.44, 0.65 - depth]), pin.exp3(np.array([0.0, 0.0, turn]))
+    assert scene.object_distances(position, rotation)[0] == pytest.approx(-depth, abs=1e-10)
+
+
+def test_distance_of_an_object_that_is_not_held_is_refused(hits):
+    with pytest.raises(RecipeError, match="no \\[object\\]"):
+        World(AIRHOCKEY, hits.robot).object_distances()
+
+
+def test_state_of_a_world_is_replaced_as_a_whole(carries):
+    world, fresh = World(HEAVY, carries.robot), World(HEAVY, carries.robot)
+    tops, zero = np.array([0.3, 0.4]), np.zeros(7)
+    world.set_state(carries.columns["goal_q"][0], zero + 1, zero + 2, tops + 1)
+    _ = world.torque, world.tip_velocity, world.segment_distances(), world.object_distances()
+    state = carries.columns["start_q"][0], zero, zero - 1, tops
+    for one in (world, fresh):
+        one.set_state(*state)
+    for name in ("q", "dq", "ddq", "torque", "tip_position", "tip_rotation", "tip_velocity", "tip_acceleration"):
+        np.testing.assert_array_equal(getattr(world, name), getattr(fresh, name))
+    assert world.segment_distances() == fresh.segment_distances()
+    assert world.object_distances() == fresh.object_distances()
+
+
+def test_judge_shares_no_code_with_what_it_judges():
+    program = """
+import sys
+import numpy as np
+from cnpgen.library import load_problem
+from cnpgen.robots.robot import load_robot
+from cnpgen.verify.rows import verify_rows
+problem = load_problem("heavy-object")
+robot = load_robot(problem)
+names = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq")]
+columns = {name: np.zeros((1, 7)) for name in names} | {"start_xyz": np.zeros((1, 3)), "goal_xyz": np.zeros((1, 3))}
+verify_rows(problem, robot, columns)
+allowed = {"cnpgen.pipelines", "cnpgen.pipelines.stage"}
+symbolic = [f"cnpgen.robots.{name}" for name in ("symbolic", "boxes", "linalg")]
+parts = ("cnpgen.kernels", "cnpgen.pipelines", "casadi", *symbolic)
+print(sorted(name for name in sys.modules if name.startswith(parts) and name not in allowed))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
