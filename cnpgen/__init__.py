@@ -6,6 +6,8 @@ Names are loaded on first use, so that importing the package costs nothing.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+__version__ = "0.1.0"
+
 if TYPE_CHECKING:
     from cnpgen.doctor import check_machine
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
@@ -52,10 +54,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version("cnpgen")
     if name not in _HOME:
         raise AttributeError(f"module 'cnpgen' has no attribute {name!r}")
     value = getattr(import_module(f"cnpgen.{_HOME[name]}"), name)

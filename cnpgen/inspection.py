@@ -8,9 +8,9 @@ from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.fields import Field
+from cnpgen.outcome import Outcome, densities_to_json
 from cnpgen.store.documents import plain
 from cnpgen.store.layout import MANIFEST, PLAN
-from cnpgen.store.outcome import Outcome, densities_to_json
 from cnpgen.store.plan import DatasetPlan, load_plan
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise

@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen import __version__
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.library import load_dataset_recipe
+from cnpgen.outcome import Outcome, merge_outcomes
 from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, Pipeline, recipe_digest, resolved, split_rows
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import finalize
-from cnpgen.store.outcome import Outcome, merge_outcomes
 from cnpgen.store.plan import DatasetPlan, ShardTask, default_shard_size, load_plan, shards
 from cnpgen.store.record import commit_shard, pending
 from cnpgen.store.workspace import clear_dataset, open_workspace
@@ -335,8 +336,9 @@ def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
 @cache
 def versions() -> dict[str, str]:
     """Versions of cnpgen, Python and the libraries that make rows."""
-    names = ("cnpgen", "numpy", "casadi", "pin", "coal", "h5py", "joblib")
-    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
+    names = ("numpy", "casadi", "pin", "coal", "h5py", "joblib")
+    machine = f"{platform.system()} {platform.machine()}"
+    found = {"cnpgen": __version__, "python": platform.python_version(), "platform": machine}
     for name in names:
         try:
             found[name] = version(name)

@@ -62,7 +62,12 @@ class Obstacle:
     name: str = field("name of the obstacle")
     x: Range = field("extent along world x", unit="m")
     y: Range = field("extent along world y", unit="m")
-    height: float = field("height of the box, measured down from its top", unit="m", default=4.0, low=1e-6)
+    height: float | None = field(
+        "height of the box, measured down from its top; none: it extends down without end",
+        unit="m",
+        default=None,
+        low=1e-6,
+    )
     top: float | None = field("height of its upper face", unit="m", default=None)
     below: str = field("the end whose object stands on this box", choices=("", "start", "goal"), default="")
 

@@ -1,5 +1,6 @@
-"""What several test modules share: one BLAS thread, prepared pipelines, rounds of draws, one small dataset per recipe."""
+"""What test modules share: one BLAS thread, prepared pipelines, rounds of draws, one small dataset per recipe."""
 
+# ruff: noqa: E402 - the environment comes first
 import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
@@ -40,7 +41,7 @@ def fastest() -> Backend:
 
 @pytest.fixture(scope="session")
 def cache_folder() -> Path:
-    """The user's own kernel cache: kernels are compiled once per version of the package, not once per run of the tests."""
+    """The user's own kernel cache: kernels are compiled once per version of the package, not per run of the tests."""
     return default_cache_folder()
 
 

@@ -20,8 +20,10 @@ from cnpgen.cli.main import main
 from cnpgen.cli.plan_text import size_text
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
+from cnpgen.outcome import Outcome
+from cnpgen.make import MAX_ROWS
+from cnpgen.pipelines.prepared import BLOCK_ROWS
 from cnpgen.store.check import Finding
-from cnpgen.store.outcome import Outcome
 from cnpgen.validation import ValidationReport
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
@@ -92,8 +94,12 @@ def test_whole_numbers_are_read_as_people_write_them(text, number):
     ],
 )
 def test_anything_else_is_no_whole_number(text):
-    with pytest.raises(ValueError, match=""):
+    with pytest.raises(ValueError, match="no whole number"):
         values.whole(text)
+
+
+def test_the_bounds_are_those_of_the_library():
+    assert (values.MOST_ROWS, values.BLOCK) == (MAX_ROWS, BLOCK_ROWS)
 
 
 @pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5", ""])
@@ -499,7 +505,7 @@ def _fail_with(monkeypatch, error):
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
-        (DatasetError("a\n  b"), 1, "a; b"),
+        (DatasetError("a\n  b"), 1, "a b"),
         (ZeroDivisionError("division\nby zero"), 3, "internal error: ZeroDivisionError: division by zero"),
         (ImportError("No module named 'casadi'"), 3, "'cnpgen doctor'"),
         (PermissionError(13, "Permission denied", "/x"), 3, "/x: Permission denied"),

@@ -12,7 +12,7 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.inspection import inspect_dataset
 from cnpgen.make import make_dataset
 from cnpgen.plots import plot_dataset
-from cnpgen.store.outcome import DensityMap, Outcome
+from cnpgen.outcome import DensityMap, Outcome
 from cnpgen.store.reader import open_dataset
 
 

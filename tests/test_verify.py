@@ -19,7 +19,8 @@ from cnpgen.verify import rows as rows_module
 from cnpgen.verify.report import Check, RowReport, merge
 from cnpgen.verify.rows import verify_rows
 from cnpgen.verify.scene import Scene
-from cnpgen.verify.world import World, obstacle_tops
+from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.verify.world import World
 
 Columns = dict[str, np.ndarray]
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")

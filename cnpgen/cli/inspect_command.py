@@ -11,7 +11,7 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 if TYPE_CHECKING:
     from cnpgen.fields import Field
     from cnpgen.inspection import Inspection
-    from cnpgen.store.outcome import Outcome
+    from cnpgen.outcome import Outcome
     from cnpgen.store.statistics import FieldStatistics
 
 

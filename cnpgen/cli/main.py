@@ -125,7 +125,7 @@ def _explain(error: BaseException) -> tuple[Sequence[str], int]:
     if isinstance(error, RecipeError):
         return error.mistakes, error.exit_code
     if isinstance(error, CnpgenError):
-        return [str(error)], error.exit_code
+        return [" ".join(str(error).split())], error.exit_code
     code = MachineError.exit_code
     if isinstance(error, ImportError):
         return [f"{error}; 'cnpgen doctor' says what is wrong with this installation"], code

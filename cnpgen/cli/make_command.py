@@ -11,8 +11,8 @@ from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
     from cnpgen.make import MadeDataset
+    from cnpgen.outcome import Outcome
     from cnpgen.recipes import DatasetRecipe
-    from cnpgen.store.outcome import Outcome
     from cnpgen.store.plan import DatasetPlan, ShardTask
 
 INTERRUPTED = "interrupted: finished shards are kept, run the same command again to go on"
@@ -33,7 +33,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("--out", metavar="DIR", type=Path, help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
-    option("--shard-size", metavar="R", type=values.positive, help="rows per file, a multiple of 4096")
+    option("--shard-size", metavar="R", type=values.shard_size, help=f"rows per file, a multiple of {values.BLOCK}")
     option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
     option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")
     option(

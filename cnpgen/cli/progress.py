@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cnpgen.store.outcome import Outcome
+    from cnpgen.outcome import Outcome
 
 
 class Meter:

@@ -6,6 +6,8 @@ from decimal import Decimal
 
 _PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
+MOST_ROWS = 10**12  # make.MAX_ROWS, and
+BLOCK = 4096  # pipelines.prepared.BLOCK_ROWS, which take long to import; a test compares them
 _LONGEST = 30  # digits; no number here has more, and very long ones take long to read
 
 
@@ -15,16 +17,13 @@ def whole(text: str) -> int:
     Raises:
         ValueError: It is none.
     """
-    if len(text) > _LONGEST:
-        raise ValueError(text)
-    if _PLAIN.fullmatch(text):
+    if len(text) <= _LONGEST and _PLAIN.fullmatch(text):
         return int(text)
-    if not _SCIENTIFIC.fullmatch(text):
-        raise ValueError(text)
-    number = Decimal(text)
-    if number != number.to_integral_value():
-        raise ValueError(text)
-    return int(number)
+    if len(text) <= _LONGEST and _SCIENTIFIC.fullmatch(text):
+        number = Decimal(text)
+        if number == number.to_integral_value():
+            return int(number)
+    raise ValueError(f"no whole number: {text[:_LONGEST]!r}")
 
 
 def _at_least(low: int, text: str, example: str) -> int:
@@ -38,8 +37,19 @@ def _at_least(low: int, text: str, example: str) -> int:
 
 
 def rows(text: str) -> int:
-    """Read a number of rows, at least 1."""
-    return _at_least(1, text, "120000, 120_000 or 1e6")
+    """Read a number of rows, 1 to 10^12."""
+    number = _at_least(1, text, "120000, 120_000 or 1e6")
+    if number > MOST_ROWS:
+        raise ArgumentTypeError(f"expected at most {MOST_ROWS:.0e} rows, got {text!r}")
+    return number
+
+
+def shard_size(text: str) -> int:
+    """Read a number of rows that is a multiple of the block size."""
+    number = _at_least(BLOCK, text, "65536")
+    if number % BLOCK:
+        raise ArgumentTypeError(f"expected a multiple of {BLOCK}, such as {-(-number // BLOCK) * BLOCK}; got {text!r}")
+    return number
 
 
 def positive(text: str) -> int:

@@ -111,10 +111,17 @@ def _source_digest(builder: Callable[..., Any]) -> str:
 
 
 def default_cache_folder() -> Path:
-    """``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
+    """``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
+
+    Raises:
+        MachineError: None of them is known.
+    """
     if os.environ.get("CNPGEN_CACHE"):
         return Path(os.environ["CNPGEN_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
+    except RuntimeError as error:
+        raise MachineError("this user has no home folder to keep kernels in: set CNPGEN_CACHE to a folder") from error
 
 
 def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from cnpgen.constraints.constraint import EXACTNESS, End
 from cnpgen.fields import Field
+from cnpgen.pipelines.collision import sample_tops
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.obstacles import obstacle_tops
 from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.recipes import Problem
 from cnpgen.robots.linalg import Scalar, dot, subtract
@@ -43,7 +43,7 @@ def acceptance(context: Context, written: set[str]) -> Run:
     n = context.robot.n
 
     def run(batch: Batch, _random: np.random.Generator) -> None:
-        tops = obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
+        tops = sample_tops(context.problem, batch)
         unmet = []
         for end in ends:
             acceleration = batch.columns.get(f"{end}_ddq")

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.obstacles import obstacle_tops
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.recipes import Problem
 from cnpgen.robots.boxes import segment_box_distance
+from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.schema import field
 
@@ -66,9 +67,7 @@ class Collision(Stage):
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             for end in self._ends():
-                (distance,) = kernel(
-                    batch[f"{end}_q"], obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
-                )
+                (distance,) = kernel(batch[f"{end}_q"], sample_tops(context.problem, batch))
                 batch[f"{end}_clearance"] = distance - radius
                 batch.reject(distance[0] > radius, f"arm in collision at the {end}")
 
@@ -79,13 +78,18 @@ class Collision(Stage):
         judge = coal_judge(context.problem, context.robot, radius, depth)
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
-            tops = obstacle_tops(context.problem, batch["start_xyz"], batch["goal_xyz"])
+            tops = sample_tops(context.problem, batch)
             hit = judge(
                 np.concatenate([batch[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends()))
             )
             batch.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
 
         return run
+
+
+def sample_tops(problem: Problem, batch: Batch) -> Array:
+    """Heights of the obstacles' upper faces for every draw [m], shape (obstacles, n)."""
+    return np.ascontiguousarray(obstacle_tops(problem, batch["start_xyz"].T, batch["goal_xyz"].T).T)
 
 
 def skeleton_distance(robot: "Robot", problem: Problem) -> Any:
@@ -142,6 +146,10 @@ def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
     import coal
     import pinocchio as pin
 
+    if any(joint.prismatic for joint in robot.chain.joints):
+        raise RecipeError(
+            ["stage 'collision' with judge = \"coal\" needs revolute joints: links that slide change length"]
+        )
     model = robot.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))

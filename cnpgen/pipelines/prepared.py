@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.kernels.library import Backend, KernelLibrary
+from cnpgen.outcome import Outcome
 from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.pipelines.tally import Tally
 from cnpgen.recipes import Pipeline, Problem, resolved
 from cnpgen.robots.robot import load_robot
-from cnpgen.store.outcome import Outcome
 
 BLOCK_ROWS = 4096
 LARGEST_ROUND = 8192

@@ -15,6 +15,7 @@ from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 INFINITE = 1e30
+STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Settings:
     max_iterations: int = 40
     radius: float = 0.3
     proximal: float = 0.1
-    penalty: float = 0.5
+    penalty: float = 2.0
     cost_tolerance: float = 2e-4
     violation_tolerance: float = 3e-4
     thin: int = 6
@@ -97,6 +98,8 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
     for iteration in range(1, settings.max_iterations + 1):
         chosen = _choose(at.g, bounds, settings.thin, 0.4 if length > 0.2 else 0.2 if length > 0.05 else 0.1)
         step = _solve(motion, at, bounds, chosen, multipliers, settings, radius * scale, violation)
+        if violation > settings.violation_tolerance and (step is None or step[1] > STUCK):
+            step = _solve(motion, at, bounds, chosen, None, settings, radius * scale, violation, relax=True) or step
         if step is None:
             radius *= 0.25
             if radius < 1e-5:
@@ -152,6 +155,8 @@ def _solve(  # noqa: PLR0917
     settings: Settings,
     box: Array,
     violation: float,
+    *,
+    relax: bool = False,
 ) -> tuple[Array, float, Array] | None:
     """Solve the quadratic model; return the step, the elastic variable and the multipliers, or None."""
     import daqp
@@ -163,14 +168,18 @@ def _solve(  # noqa: PLR0917
     rows = np.empty((m, nx + 1))
     rows[:, :nx] = motion.rows(at, k, which)
     rows[:, nx] = below - above
+    high = np.where(below > 0, INFINITE, upper - g)
+    low = np.where(above > 0, -INFINITE, lower - g)
+    if relax:  # what is met may be broken, too, as far as the worst violation is left
+        nearer = upper - g < g - lower
+        rows[:, nx] = np.where(nearer, -violation, violation)
+        high, low = np.where(nearer, upper - g, INFINITE), np.where(nearer, -INFINITE, lower - g)
     hessian = np.zeros((nx + 1, nx + 1))
     diagonal = np.arange(nx)
     hessian[diagonal, diagonal] = settings.proximal
     hessian[motion.split : nx, motion.split : nx] += at.curvature
     hessian[nx, nx] = 1e-8
     linear = np.append(at.gradient, settings.penalty * violation + 1e-3)
-    high = np.where(below > 0, INFINITE, upper - g)
-    low = np.where(above > 0, -INFINITE, lower - g)
     sense = np.zeros(nx + 1 + m, np.int32)
     if multipliers is not None:
         before = multipliers[k, which]

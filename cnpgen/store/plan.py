@@ -57,7 +57,7 @@ class DatasetPlan:
         recipe: The resolved recipe as nested tables.
         seed: Root seed.
         splits: Split name -> rows.
-        shard_size: Rows per shard, a multiple of ``block_rows``; the last shard of a split may be shorter.
+        shard_size: Rows per shard; the last shard of a split may be shorter.
         block_rows: Rows per block.
         dtype: Float type of the stored numbers, "float64" or "float32".
         backend: Which kernels computed them: "compiled", "numpy", ...
@@ -114,10 +114,8 @@ class DatasetPlan:
 
 
 def _check_sizes(plan: DatasetPlan) -> None:
-    if plan.block_rows < 1 or plan.shard_size < 1 or plan.shard_size % plan.block_rows:
-        raise UsageError(
-            f"the shard size must be a positive multiple of the block size {plan.block_rows}, got {plan.shard_size}"
-        )
+    if plan.block_rows < 1 or plan.shard_size < 1:
+        raise UsageError(f"the shard size must be at least 1, got {plan.shard_size}")
     if plan.seed < 0:
         raise UsageError(f"the seed must not be negative, got {plan.seed}")
     if plan.dtype not in {"float64", "float32"}:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.outcome import Outcome, densities_to_json, merge_outcomes
+from cnpgen.outcome import Outcome, densities_to_json, merge_outcomes
 from cnpgen.store.plan import DatasetPlan, ShardTask, shards
 from cnpgen.store.record import ShardRecord, load_committed
 from cnpgen.store.statistics import FieldStatistics, merge_statistics

@@ -29,7 +29,7 @@ def open_workspace(folder: Path, plan: DatasetPlan) -> None:
                 f"{folder} holds another dataset ({_difference(found, plan)});"
                 " choose another --out, or replace it with --force"
             )
-    elif folder.is_dir() and any(folder.iterdir()):
+    elif folder.is_dir() and any(path.name != WORK for path in folder.iterdir()):
         raise UsageError(f"{folder} is not empty and not a dataset of cnpgen; choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -51,14 +51,14 @@ def clear_dataset(folder: Path) -> None:
         return
     if not (folder / PLAN).is_file():
         raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
-    splits = {path.parent for path in folder.glob("*/shard-*.*")}
+    splits = [folder / split for split in load_plan(folder).splits]
     try:
         for name in ("manifest.json", *_DOCUMENTS):  # the manifest first: what is half deleted must not look complete
             (folder / name).unlink(missing_ok=True)
         for split in splits:
             for path in split.glob("shard-*.*"):
                 path.unlink()
-            if not any(split.iterdir()):
+            if split.is_dir() and not any(split.iterdir()):
                 split.rmdir()
         shutil.rmtree(folder / WORK, ignore_errors=True)
     except OSError as error:

@@ -1,10 +1,12 @@
 """Boundary control points: position, velocity and acceleration at the ends, exactly (paper, Appendix A)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 
@@ -39,7 +41,7 @@ class Boundary:
     def __len__(self) -> int:
         return len(self.start_q)
 
-    def __getitem__(self, index: slice | Array) -> "Boundary":
+    def __getitem__(self, index: slice | NDArray[Any]) -> "Boundary":
         return Boundary(
             self.start_q[index],
             self.start_dq[index],
@@ -61,8 +63,7 @@ def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array
     Returns:
         Shape (N, 3, n).
     """
-    path = end_derivatives(spec.path_control_points, spec.degree)
-    speed = end_derivatives(spec.rate_control_points, spec.degree)
+    path, speed = _end_derivatives(spec)
     slope = speed.eta * (rate[:, 1:2] - rate[:, :1])
     return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], slope=slope, path=path)
 
@@ -78,13 +79,23 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     Returns:
         Shape (N, 2 or 3, n).
     """
-    path = end_derivatives(spec.path_control_points, spec.degree)
-    speed = end_derivatives(spec.rate_control_points, spec.degree)
+    path, speed = _end_derivatives(spec)
     # Reversed in phase, r' and p' change sign: the goal is a start with -dq.
     slope = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
     acceleration = np.zeros_like(boundary.goal_q) if boundary.goal_ddq is None else boundary.goal_ddq
     points = _three(boundary.goal_q, -boundary.goal_dq, acceleration, rate[:, -1:], slope=slope, path=path)
     return points[:, boundary.fixed_at_goal - 1 :: -1]
+
+
+def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivatives]:
+    """Return eta and beta of p and of r."""
+    if spec.path_control_points < spec.degree + 2:  # a single span, whose second derivative is another
+        raise UsageError(
+            f"boundary accelerations need at least {spec.degree + 2} path control points of degree {spec.degree},"
+            f" got {spec.path_control_points}"
+        )
+    path = end_derivatives(spec.path_control_points, spec.degree)
+    return path, end_derivatives(spec.rate_control_points, spec.degree)
 
 
 def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, slope: Array, path: EndDerivatives) -> Array:

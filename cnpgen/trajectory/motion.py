@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.recipes import TrajectorySpec
-from cnpgen.trajectory.spline import basis, gauss_rule
+from cnpgen.trajectory.spline import basis, graded_edges, horner, lowest, pick, pieces
 
 Array = NDArray[np.float64]
+_NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2  # on [0, 1]
 
 
 @dataclass(frozen=True)
@@ -62,26 +63,29 @@ class Motion:
         Args:
             s: Phases in [0, 1], shape (K,), the same for all motions, or (N, K).
         """
-        if s.ndim == 2:
-            parts = [Motion(self.path[[i]], self.rate[[i]], self.degree).at(s[i]) for i in range(len(self))]
-            return States(*(np.concatenate([getattr(part, name) for part in parts]) for name in States.__annotations__))
-        p = [basis(s, self.path.shape[1], self.degree, order) @ self.path for order in range(4)]
-        r, r1, r2 = (self.rate @ basis(s, self.rate.shape[1], self.degree, order).T for order in range(3))
-        a, b, c = r[..., None], r1[..., None], r2[..., None]
-        return States(
-            q=p[0],
-            dq=p[1] * a,
-            ddq=p[2] * a**2 + p[1] * b * a,
-            jerk=p[3] * a**3 + 3 * p[2] * b * a**2 + p[1] * (c * a + b**2) * a,
-            rate=r,
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # garbage in, nan out
+            if s.ndim == 1:
+                p = [basis(s, self.path.shape[1], self.degree, order) @ self.path for order in range(4)]
+                r = [self.rate @ basis(s, self.rate.shape[1], self.degree, order).T for order in range(3)]
+            else:
+                path, rate = (pick(pieces(control, self.degree), s) for control in (self.path, self.rate))
+                p, r = [horner(*path, order) for order in range(4)], [horner(*rate, order) for order in range(3)]
+            return _states(p, r)
+
+    def runs_forward(self) -> NDArray[np.bool_]:
+        """Whether r > 0 from start to goal, between any samples, too; False where r is not finite. Shape (N,)."""
+        forward: NDArray[np.bool_] = np.asarray(np.isfinite(self.rate).all(axis=1))
+        in_doubt = forward & (self.rate <= 0).any(axis=1)  # a B-spline is between its control points
+        for i in np.flatnonzero(in_doubt):
+            forward[i] = lowest(self.rate[i], self.degree) > 0
+        return forward
 
     def duration(self) -> Array:
-        """Duration ``T = integral of 1 / r`` [s], shape (N,); inf or negative where r is not positive."""
-        s, weights = gauss_rule(self.rate.shape[1], self.degree)
-        with np.errstate(divide="ignore"):
-            inverse: Array = 1.0 / (self.rate @ basis(s, self.rate.shape[1], self.degree).T)
-        return inverse @ weights
+        """Duration ``T = integral of 1 / r`` [s], shape (N,); inf where r is not positive, nan where not finite."""
+        total = self.time_at(np.ones(1))[:, 0]
+        total[~self.runs_forward()] = np.inf
+        total[~np.isfinite(self.rate).all(axis=1)] = np.nan
+        return total
 
     def time_at(self, s: Array) -> Array:
         """Time at phases s, ``t(s) = integral of 1 / r from 0 to s`` [s].
@@ -90,37 +94,44 @@ class Motion:
             s: Ascending phases, shape (K,), s[0] >= 0.
 
         Returns:
-            Shape (N, K).
+            Shape (N, K); without meaning where r is not positive.
         """
-        edges = np.unique(np.concatenate([np.linspace(0, 1, 4 * (self.rate.shape[1] - self.degree) + 1), [0.0], s]))
-        nodes, weights = np.polynomial.legendre.leggauss(6)
+        edges = np.union1d(graded_edges(self.rate.shape[1], self.degree), s)
         width = np.diff(edges)
-        points = edges[:-1, None] + width[:, None] * (nodes + 1) / 2
-        rate = self.rate @ basis(points.ravel(), self.rate.shape[1], self.degree).T
-        pieces = (1.0 / rate).reshape(len(self), len(width), len(nodes)) @ (weights / 2) * width
-        total = np.concatenate([np.zeros((len(self), 1)), np.cumsum(pieces, axis=1)], axis=1)
+        points = edges[:-1, None] + width[:, None] * _NODES
+        with np.errstate(all="ignore"):  # garbage in, garbage out
+            rate = self.rate @ basis(points.ravel(), self.rate.shape[1], self.degree).T
+            cells = (1.0 / rate).reshape(len(self), *points.shape) @ _WEIGHTS * width
+            total = np.concatenate([np.zeros((len(self), 1)), np.cumsum(cells, axis=1)], axis=1)
         return np.asarray(total[:, np.searchsorted(edges, s)])
 
     def phase_at(self, t: Array) -> Array:
-        """Phase at times t: the inverse of ``time_at``, by interpolation and Newton's method.
+        """Phase at times t: the inverse of ``time_at``, by Newton's method within the cells of its quadrature.
 
         Args:
             t: Times in [0, T] [s], shape (N, K); clipped to the motion.
 
         Returns:
-            Shape (N, K).
+            Shape (N, K), exactly 0 and 1 at the ends; without meaning where r is not positive.
         """
-        grid = np.linspace(0, 1, 513)
-        known = self.time_at(grid)
-        s = np.array([np.interp(times, row, grid) for times, row in zip(t, known, strict=True)])
-        for _ in range(3):
-            for i in range(len(self)):
-                one = Motion(self.path[[i]], self.rate[[i]], self.degree)
-                order = np.argsort(s[i], kind="stable")
-                now, rate = np.empty_like(s[i]), one.at(s[i]).rate[0]
-                now[order] = one.time_at(s[i][order])[0]
-                s[i] = np.clip(s[i] + (np.clip(t[i], 0, known[i, -1]) - now) * rate, 0.0, 1.0)
-        return s
+        edges = graded_edges(self.rate.shape[1], self.degree)
+        known = self.time_at(edges)
+        with np.errstate(all="ignore"):
+            t = np.clip(t, 0.0, known[:, -1:])
+            found = [np.searchsorted(row, times, side="right") for row, times in zip(known, t, strict=True)]
+            cell = np.clip(np.array(found).reshape(t.shape) - 1, 0, len(edges) - 2)
+            low, width = edges[cell], np.diff(edges)[cell]
+            rate, offset = pick(pieces(self.rate, self.degree), low + width / 2)
+            offset = offset - width / 2
+            left = t - np.take_along_axis(known, cell, axis=1)
+            ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
+            for _ in range(30):  # three or four, unless r is not positive
+                nodes = (weight / horner(rate, offset + ahead * x) for x, weight in zip(_NODES, _WEIGHTS, strict=True))
+                before = ahead
+                ahead = np.clip(ahead + (left - ahead * sum(nodes)) * horner(rate, offset + ahead), 0.0, width)
+                if np.nanmax(np.abs(ahead - before), initial=0.0) < 1e-15:
+                    break
+        return np.where(t >= known[:, -1:], 1.0, low + ahead)
 
     def slower(self, factor: Array) -> "Motion":
         """Slow the motions down uniformly: the path stays, the rate is divided by ``factor`` (shape (N,), at least 1).
@@ -128,3 +139,15 @@ class Motion:
         Exact for motions from rest to rest: their boundary velocities and accelerations stay zero.
         """
         return Motion(self.path, self.rate / factor[:, None], self.degree)
+
+
+def _states(p: list[Array], r: list[Array]) -> States:
+    """Apply the chain rule to the derivatives of p in s, shape (N, K, n) each, and of r, shape (N, K)."""
+    r0, r1, r2 = (x[..., None] for x in r)
+    return States(
+        q=p[0],
+        dq=p[1] * r0,
+        ddq=p[2] * r0**2 + p[1] * r1 * r0,
+        jerk=p[3] * r0**3 + 3 * p[2] * r1 * r0**2 + p[1] * (r2 * r0 + r1**2) * r0,
+        rate=r[0],
+    )

@@ -1,7 +1,8 @@
-"""Clamped uniform B-splines: knots, basis matrices, and what their control points are worth at the ends."""
+"""Clamped uniform B-splines: knots, basis matrices, pieces, and what their control points are worth at the ends."""
 
 from dataclasses import dataclass
 from functools import cache
+from math import factorial, perm
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,64 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     return np.ascontiguousarray(values)
 
 
+def pieces(control: Array, degree: int) -> Array:
+    """Turn N splines into polynomials between their knots, for ``pick`` and ``horner``.
+
+    Args:
+        control: Control points, shape (N, C) or (N, C, n).
+        degree: Degree D.
+
+    Returns:
+        Coefficients of the powers of (s - left knot), highest first, shape (D + 1, spans, N, ...).
+    """
+    points = control.shape[1]
+    left = np.arange(points - degree) / (points - degree)
+    taylor = [
+        np.tensordot(basis(left, points, degree, order), control, (1, 1)) / factorial(order)
+        for order in range(degree, -1, -1)
+    ]
+    return np.stack(taylor)
+
+
+def pick(coefficients: Array, s: Array) -> tuple[Array, Array]:
+    """Pick, for every spline, the pieces in which its own phases are.
+
+    Args:
+        coefficients: What ``pieces`` returned.
+        s: Phases in [0, 1], shape (N, K).
+
+    Returns:
+        ``(picked, offset)``: coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
+    """
+    spans = coefficients.shape[1]
+    span = np.clip(np.nan_to_num(s) * spans, 0, spans - 1).astype(np.intp)
+    return coefficients[:, span, np.arange(len(s))[:, None]], s - span / spans
+
+
+def horner(picked: Array, offset: Array, order: int = 0) -> Array:
+    """Evaluate what ``pick`` returned, or a derivative of it.
+
+    Returns:
+        Shape (N, K, ...).
+    """
+    degree = len(picked) - 1
+    offset = offset.reshape(*offset.shape, *(1,) * (picked.ndim - 3))
+    value = np.zeros(picked.shape[1:])
+    for power in range(degree, order - 1, -1):
+        value = value * offset + perm(power, order) * picked[degree - power]
+    return value
+
+
+def lowest(control: Array, degree: int) -> float:
+    """Return the smallest value on [0, 1] of one spline of finite control points, shape (C,)."""
+    from scipy.interpolate import BSpline, PPoly
+
+    spline = BSpline(clamped_knots(len(control), degree), control, degree)
+    turning = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
+    s = np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]])
+    return float(spline(np.clip(s, 0, 1)).min())
+
+
 @dataclass(frozen=True)
 class EndDerivatives:
     """Derivatives of a clamped uniform B-spline at s = 0 (mirrored at s = 1).
@@ -60,6 +119,22 @@ def end_derivatives(points: int, degree: int) -> EndDerivatives:
 def chebyshev(count: int) -> Array:
     """Return ``(1 - cos(pi k / K)) / 2`` for k = 0..K: dense at both ends, where clamped basis functions are narrow."""
     return (1 - np.cos(np.pi * np.arange(count + 1) / count)) / 2
+
+
+@cache
+def graded_edges(points: int, degree: int) -> Array:
+    """Return edges of cells on [0, 1] in which 1 / r is smooth enough for eight Gauss nodes.
+
+    Four cells per span, and cells that shrink by halves towards s = 0 and s = 1: there the first basis function is
+    0.01 wide, and 1 / r is nearly singular where the first control point is much smaller than the second. With cells
+    of equal size the duration of such motions is wrong in the third digit.
+
+    Returns:
+        Ascending, from 0 to 1; the knots are among them.
+    """
+    spans = points - degree
+    end = 0.5 ** np.arange(24, 2, -1)
+    return np.unique(np.concatenate([np.linspace(0, spans, 4 * spans + 1), end, spans - end])) / spans
 
 
 @cache

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from cnpgen.constraints.constraint import EXACTNESS, Condition
 from cnpgen.errors import DatasetError
+from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
-from cnpgen.verify.world import World, obstacle_tops
+from cnpgen.verify.world import World
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem
