@@ -11,7 +11,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-LIBRARIES = ("cnpgen", "numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
+import cnpgen
+
+LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
 INSTRUCTION_SETS = ("avx512f", "avx2", "avx", "asimd")  # best first
 
 
@@ -35,7 +37,7 @@ def machine() -> dict[str, Any]:
         "instructions": next((name for name in INSTRUCTION_SETS if name in flags), platform.machine()),
         "load": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
-        "versions": {name: _version(name) for name in LIBRARIES},
+        "versions": {"cnpgen": cnpgen.__version__, **{name: _version(name) for name in LIBRARIES}},
     }
 
 
@@ -48,7 +50,7 @@ def _version(name: str) -> str:
     try:
         return version(name)
     except PackageNotFoundError:
-        return "checkout"
+        return "not installed"
 
 
 def machine_line() -> str:

@@ -21,7 +21,7 @@ from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
 from cnpgen.pipelines.stage import Batch, Run, Stage
 
 PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object")
-BLOCKS = {"compiled": 16, "numpy": 2, "casadi": 1}  # per repetition: about half a second each
+BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition
 TARGETS = {  # accepted rows per second and core
     ("airhockey-replan", "compiled"): 120_000,
     ("airhockey-replan", "numpy"): 12_000,

@@ -334,10 +334,13 @@ def _reference_goal(
     else:
         with watch.step("goal: velocity (HiGHS)"):
             hitting_speed(arm, q, direction)
-    others = [hit.solve(_nearby(arm, hit, random)) for _ in range(starts - 1)]
-    for what, rivals in (("hitting configuration", [q]), (f"... against the best of {starts} starts", [q, *others])):
-        solved = [x for x in rivals if x is not None]
-        if solved and (len(rivals) == 1 or others):
+    rivals = {"hitting configuration": [q]}
+    if starts > 1:
+        others = [hit.solve(_nearby(arm, hit, random)) for _ in range(starts - 1)]
+        rivals[f"... against the best of {starts} starts"] = [q, *others]
+    for what, found_qs in rivals.items():
+        solved = [x for x in found_qs if x is not None]
+        if solved:
             best, ours = max(solved, key=hit.objective), sample["goal_q"]
             case = {"start_q": hit.home, "p": hit.target, "d": direction, "our_q": ours, "their_q": best}
             found.compare(what, hit.objective(ours), hit.objective(best), **case)

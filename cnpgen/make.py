@@ -1,11 +1,10 @@
 """Making datasets: the plan, the pool of workers, the shards, the manifest."""
 
 import hashlib
-import os
 import platform
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -32,6 +31,9 @@ SPOT_CHECKS = 32  # rows of every shard that Pinocchio and Coal recompute before
 MAX_ROWS = 10**12
 
 Progress = Callable[[int, Outcome], None]  # called with the rows and the outcome of every shard that is finished
+Begin = Callable[
+    [Path, int, int], None
+]  # called once with the folder, the rows wanted and those that are there already
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ def make_dataset(
     backend: str | None = None,
     force: bool = False,
     part: tuple[int, int] | None = None,
+    begin: Begin | None = None,
     progress: Progress | None = None,
 ) -> MadeDataset:
     """Make a dataset, or finish one that was interrupted.
@@ -101,6 +104,7 @@ def make_dataset(
         force: Whether to delete another dataset that is in the folder.
         part: ``(k, m)``: make only every m-th shard, beginning with the k-th, for arrays of batch jobs; whoever finds
             all shards there finishes the dataset.
+        begin: Called once with (folder, rows that this call is about, rows of them that are there already).
         progress: Called with (rows, outcome) of every finished shard.
 
     Raises:
@@ -116,7 +120,12 @@ def make_dataset(
     if force:
         clear_dataset(job.folder)
     open_workspace(job.folder, job.plan)
-    tasks = _select(pending(job.folder, job.plan), job.plan, part)
+    mine = _select(shards(job.plan), part)
+    waiting = set(pending(job.folder, job.plan))
+    tasks = [task for task in mine if task in waiting]
+    if begin is not None:
+        rows = sum(task.rows for task in mine)
+        begin(job.folder, rows, rows - sum(task.rows for task in tasks))
     made = 0
     for rows, outcome in _run(job, tasks, worker_count(workers, len(tasks))):
         made += rows
@@ -214,7 +223,8 @@ def make_shard(job: Job, task: ShardTask) -> tuple[int, Outcome]:
     started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     prepared = _prepared(job)
     columns, outcome = shard_columns(prepared, job.plan, task)
-    spot_check(prepared, columns, job.plan, task)
+    worst = spot_check(prepared, columns, job.plan, task)
+    outcome = replace(outcome, verification=worst)
     seconds = round(time.perf_counter() - clock, 3)
     commit_shard(
         job.folder,
@@ -231,8 +241,11 @@ def make_shard(job: Job, task: ShardTask) -> tuple[int, Outcome]:
 
 def spot_check(
     prepared: PreparedPipeline, columns: dict[str, NDArray[Any]], plan: DatasetPlan, task: ShardTask
-) -> None:
+) -> dict[str, float]:
     """Recompute some rows with Pinocchio and Coal: a wrong compiler must not get a shard past this point.
+
+    Returns:
+        The worst violation of every check, in its unit.
 
     Raises:
         MachineError: A row is not what the kernels said it is.
@@ -248,6 +261,7 @@ def spot_check(
             f"row {task.first_row + rows[report.out[0]]} of split {task.split!r} fails Pinocchio's check ({wrong}):"
             f" the {plan.backend!r} backend computes wrong numbers on this machine; try another --backend"
         )
+    return {check.name: check.worst for check in report.checks}
 
 
 _PREPARED: dict[str, PreparedPipeline] = {}
@@ -292,22 +306,22 @@ def worker_count(workers: int | None, tasks: int) -> int:
         UsageError: Fewer than one was asked for.
     """
     if workers is None:
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return max(1, min(available, tasks))
+        from joblib import cpu_count
+
+        return max(1, min(int(cpu_count()), tasks))
     if workers < 1:
         raise UsageError(f"workers must be at least 1, got {workers}")
     return max(1, min(workers, tasks))
 
 
-def _select(tasks: list[ShardTask], plan: DatasetPlan, part: tuple[int, int] | None) -> list[ShardTask]:
+def _select(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
     """Keep the tasks of one part of a job array."""
     if part is None:
         return tasks
     k, m = part
     if not (m >= 1 and 0 <= k < m):
         raise UsageError(f"part must be K/M with 0 <= K < M, got {k}/{m}")
-    mine = set(shards(plan)[k::m])
-    return [task for task in tasks if task in mine]
+    return tasks[k::m]
 
 
 def _notes(recipe: DatasetRecipe) -> str:

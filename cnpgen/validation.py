@@ -49,8 +49,8 @@ class ValidationReport:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
-        return not self.findings
+        """Whether nothing is wrong; notes are not."""
+        return all(finding.note for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report for JSON."""
@@ -58,7 +58,9 @@ class ValidationReport:
             "folder": str(self.folder),
             "ok": self.ok,
             "rows": self.rows,
-            "findings": [{"file": finding.file, "problem": finding.problem} for finding in self.findings],
+            "findings": [
+                {"file": finding.file, "problem": finding.problem, "note": finding.note} for finding in self.findings
+            ],
             "deep": self.deep.to_dict() if self.deep else None,
             "regenerated": self.regenerated,
             "identical": self.identical,
@@ -66,9 +68,10 @@ class ValidationReport:
 
     def summary(self) -> str:
         """Say in a few lines what was checked and what came out."""
-        lines = [f"{self.folder}: {self.rows} rows, {len(self.findings) or 'no'} findings"]
+        wrong = sum(not finding.note for finding in self.findings)
+        lines = [f"{self.folder}: {self.rows:,} rows, {wrong or 'no'} finding{'s' if wrong != 1 else ''}"]
         if self.deep:
-            lines.append(f"  recomputed with Pinocchio and Coal: {self.deep.rows} rows, {len(self.deep.out)} out")
+            lines.append(f"  recomputed with Pinocchio and Coal: {self.deep.rows:,} rows, {len(self.deep.out):,} out")
             lines += [
                 f"    {check.name:<22} worst {check.worst:9.2e} of {check.allowed:9.2e} {check.unit:<8}"
                 f" {check.rows_out} rows out"

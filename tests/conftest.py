@@ -23,6 +23,7 @@ from cnpgen.make import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
 from cnpgen.recipes import DatasetRecipe, Pipeline
+from cnpgen.robots.robot import Robot
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
@@ -79,6 +80,43 @@ def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: s
         if type(stage).__name__ == until:
             break
     return batch
+
+
+class Arm:
+    """A robot as Pinocchio sees it, one state at a time: the reference of the stages' tests.
+
+    Args:
+        robot: The robot; its reduced Pinocchio model is used and nothing else of it.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        import pinocchio as pin
+
+        self.pin, self.model, self.data = pin, robot.model, robot.model.createData()
+        self.tip, self.frame = robot.model.getFrameId(robot.tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+    def pose(self, q: np.ndarray) -> Any:
+        """Placement of the tip in the world."""
+        self.pin.framesForwardKinematics(self.model, self.data, q)
+        return self.data.oMf[self.tip]
+
+    def jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Jacobian of the tip in world axes, linear rows first, shape (6, n)."""
+        return np.array(self.pin.computeFrameJacobian(self.model, self.data, q, self.tip, self.frame))
+
+    def velocity(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Velocity of the tip [m/s]."""
+        self.pin.forwardKinematics(self.model, self.data, q, dq)
+        return np.array(self.pin.getFrameVelocity(self.model, self.data, self.tip, self.frame).linear)
+
+    def acceleration(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Acceleration of the tip [m/s^2]."""
+        self.pin.forwardKinematics(self.model, self.data, q, dq, ddq)
+        return np.array(self.pin.getFrameClassicalAcceleration(self.model, self.data, self.tip, self.frame).linear)
+
+    def torque(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Inverse dynamics [N m]."""
+        return np.array(self.pin.rnea(self.model, self.data, q, dq, ddq))
 
 
 def without_stages(pipeline: Pipeline, *kinds: str) -> Pipeline:

@@ -8,6 +8,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, NoReturn
 
 from cnpgen.cli import (
@@ -67,8 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code, as ``cnpgen --help`` lists them.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a title must not stop a terminal that cannot show it
+    _prepare_streams()
     with _warnings_on_one_line():
         try:
             code = _run(words)
@@ -132,16 +132,25 @@ def _explain(error: BaseException) -> tuple[Sequence[str], int]:
     if isinstance(error, MemoryError):
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:
-        return [f"{error.filename or 'the system'}: {error.strerror}"], code
+        return [f"{error.filename}: {error.strerror}" if error.filename else error.strerror], code
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return [
         f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"
     ], code
 
 
+def _prepare_streams() -> None:
+    """Make sure that printing does not fail: Python has no stdout or stderr where the shell has closed them."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open until the end
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a title must not stop a terminal that cannot show it
+
+
 def _leave_pipe() -> int:
     """Give stdout somewhere to go, so that Python does not complain when it flushes it at exit."""
-    with suppress(OSError, ValueError, AttributeError):
+    with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return NOBODY_READS
 

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from cnpgen.make import MadeDataset
     from cnpgen.outcome import Outcome
     from cnpgen.recipes import DatasetRecipe
-    from cnpgen.store.plan import DatasetPlan, ShardTask
 
 INTERRUPTED = "interrupted: finished shards are kept, run the same command again to go on"
 
@@ -33,7 +32,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("--out", metavar="DIR", type=Path, help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
-    option("--shard-size", metavar="R", type=values.shard_size, help=f"rows per file, a multiple of {values.BLOCK}")
+    option("--shard-size", metavar="R", type=values.positive, help="rows per file (default: 8192 to 65536)")
     option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
     option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")
     option(
@@ -70,14 +69,11 @@ def _settings(arguments: argparse.Namespace) -> dict[str, object]:
 def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
     from cnpgen.make import make_dataset
 
-    folder = arguments.out or default_folder(recipe)
-    tasks, there = _scope(recipe, folder, arguments)
-    initial = sum(task.rows for task in there)
-    meter = Meter(f"making {folder}", sum(task.rows for task in tasks), initial, quiet=arguments.quiet)
+    meter = Meter(quiet=arguments.quiet)
     try:
         made = make_dataset(
             recipe,
-            folder,
+            arguments.out,
             n=arguments.n,
             seed=arguments.seed,
             workers=arguments.workers,
@@ -86,6 +82,7 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
             backend=arguments.backend,
             force=arguments.force,
             part=arguments.part,
+            begin=lambda folder, total, there: meter.begin(f"making {folder}", total, there),
             progress=meter,
         )
     finally:
@@ -93,46 +90,6 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
     if not arguments.quiet:
         print("\n".join(_summary(made, meter)), file=sys.stderr)
     print(made.folder)
-
-
-def default_folder(recipe: "DatasetRecipe") -> Path:
-    """Return the folder that a dataset is made in unless another is given."""
-    return Path(f"{recipe.name}-v{recipe.version.partition('.')[0]}")
-
-
-def _scope(
-    recipe: "DatasetRecipe", folder: Path, arguments: argparse.Namespace
-) -> tuple[list["ShardTask"], list["ShardTask"]]:
-    """List the shards that this run is about, and those of them that are there already."""
-    from cnpgen.recipes import split_rows
-    from cnpgen.store.plan import ShardTask, default_shard_size
-    from cnpgen.store.record import is_committed
-
-    total = arguments.n or sum(recipe.splits.values())
-    begun = _begun(recipe, folder, total, arguments)
-    size = arguments.shard_size or (begun.shard_size if begun else default_shard_size(total))
-    tasks = [
-        ShardTask(split, index, first, min(size, rows - first))
-        for split, rows in split_rows(recipe, total).items()
-        for index, first in enumerate(range(0, rows, size))
-    ]
-    k, m = arguments.part or (0, 1)
-    mine = tasks[k::m]
-    return mine, [task for task in mine if begun and is_committed(folder, task, begun.fingerprint)]
-
-
-def _begun(recipe: "DatasetRecipe", folder: Path, total: int, arguments: argparse.Namespace) -> "DatasetPlan | None":
-    """Return the plan in the folder if it is, as far as can be told without building kernels, the one to go on with."""
-    from cnpgen.recipes import recipe_digest, split_rows
-    from cnpgen.store.layout import PLAN
-    from cnpgen.store.plan import load_plan
-
-    if arguments.force or not (folder / PLAN).is_file():
-        return None
-    plan = load_plan(folder)
-    seed = recipe.seed if arguments.seed is None else arguments.seed
-    wanted = (split_rows(recipe, total), recipe_digest(recipe), seed, arguments.dtype)
-    return plan if (plan.splits, plan.recipe_sha256, plan.seed, plan.dtype) == wanted else None
 
 
 def _summary(made: "MadeDataset", meter: Meter) -> list[str]:

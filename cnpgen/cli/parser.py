@@ -10,13 +10,21 @@ Command = Callable[[argparse.Namespace], int]
 """What a command runs: a function of the parsed arguments that returns the exit code."""
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Help with enough room for the longest command; argparse forgets that commands are indented."""
+
+    def __init__(self, prog: str, **options: Any) -> None:
+        super().__init__(prog, **options)
+        self._action_max_length = len("    make-dataset")
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that raises UsageError instead of printing its usage and leaving."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(
             allow_abbrev=False,  # a script must not break when an option is added
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=_Help,
             **options,
         )
 

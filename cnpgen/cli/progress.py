@@ -13,9 +13,6 @@ class Meter:
     """Counts rows, and what became of their draws.
 
     Args:
-        title: What is going on.
-        total: Rows at the end.
-        initial: Rows that are there already.
         quiet: Whether to show nothing.
 
     Attributes:
@@ -23,18 +20,28 @@ class Meter:
         outcome: The fates of their draws.
     """
 
-    def __init__(self, title: str, total: int, initial: int = 0, *, quiet: bool = False) -> None:
+    def __init__(self, *, quiet: bool = False) -> None:
         self.rows = 0
         self.outcome: Outcome | None = None
+        self._quiet = quiet
         self._start = time.perf_counter()
         self._bar: Any = None
-        if not quiet and sys.stderr.isatty():
+
+    def begin(self, title: str, total: int, initial: int = 0) -> None:
+        """Show that something begins.
+
+        Args:
+            title: What is going on.
+            total: Rows at the end.
+            initial: Rows that are there already.
+        """
+        if not self._quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
             self._bar = tqdm(
                 desc=title, total=total, initial=initial, unit="row", unit_scale=True, dynamic_ncols=True, leave=False
             )
-        elif not quiet:
+        elif not self._quiet:
             there = f", {initial:,} are there already" if initial else ""
             print(f"{title}: {total:,} rows{there}", file=sys.stderr, flush=True)
 

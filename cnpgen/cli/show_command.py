@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,6 +80,8 @@ def _kind(name_or_path: str) -> "Kind":
 
 def _kind_of_file(path: Path) -> "Kind":
     """Tell the kind of a recipe file by its keys; of a file that cannot be read the loader says what is wrong."""
+    import tomllib
+
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):

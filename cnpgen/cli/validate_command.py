@@ -50,7 +50,8 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
     rows = _rows(arguments.folder) if arguments.deep else 0
     if not rows:
         return validate_dataset(arguments.folder, **options)
-    meter = Meter(f"validating {arguments.folder}", rows)
+    meter = Meter()
+    meter.begin(f"validating {arguments.folder}", rows)
     try:
         return validate_dataset(arguments.folder, **options, progress=meter)
     finally:

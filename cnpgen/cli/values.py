@@ -7,7 +7,6 @@ from decimal import Decimal
 _PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
 MOST_ROWS = 10**12  # make.MAX_ROWS, and
-BLOCK = 4096  # pipelines.prepared.BLOCK_ROWS, which take long to import; a test compares them
 _LONGEST = 30  # digits; no number here has more, and very long ones take long to read
 
 
@@ -41,14 +40,6 @@ def rows(text: str) -> int:
     number = _at_least(1, text, "120000, 120_000 or 1e6")
     if number > MOST_ROWS:
         raise ArgumentTypeError(f"expected at most {MOST_ROWS:.0e} rows, got {text!r}")
-    return number
-
-
-def shard_size(text: str) -> int:
-    """Read a number of rows that is a multiple of the block size."""
-    number = _at_least(BLOCK, text, "65536")
-    if number % BLOCK:
-        raise ArgumentTypeError(f"expected a multiple of {BLOCK}, such as {-(-number // BLOCK) * BLOCK}; got {text!r}")
     return number
 
 

@@ -18,9 +18,23 @@ End = Literal["start", "goal"]
 # How exactly a boundary state must meet its conditions, by the type that it is stored in. Limits are relative, the
 # rest is SI.
 EXACTNESS: dict[str, dict[str, float]] = {
-    "float64": {"limit": 1e-12, "position": 1e-8, "angle": 1e-8, "velocity": 1e-9, "acceleration": 1e-9},
-    "float32": {"limit": 1e-12, "position": 1e-6, "angle": 1e-5, "velocity": 1e-5, "acceleration": 1e-4},
-}
+    "float64": {
+        "limit": 1e-12,
+        "position": 1e-8,
+        "angle": 1e-8,
+        "direction": 1e-9,
+        "velocity": 1e-9,
+        "acceleration": 1e-9,
+    },
+    "float32": {
+        "limit": 1e-12,
+        "position": 1e-6,
+        "angle": 1e-5,
+        "direction": 1e-5,
+        "velocity": 1e-5,
+        "acceleration": 1e-4,
+    },
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ from cnpgen.robots.symbolic import SymbolicState, symbols
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
+ROUNDING = 1e-14  # m/s: of a velocity that ought to be zero
+
 
 def acceptance(context: Context, written: set[str]) -> Run:
     """Prepare the gate.

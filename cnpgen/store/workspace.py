@@ -52,6 +52,11 @@ def clear_dataset(folder: Path) -> None:
     if not (folder / PLAN).is_file():
         raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
     splits = [folder / split for split in load_plan(folder).splits]
+    foreign = _foreign(folder, splits)
+    if foreign:
+        raise UsageError(
+            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
+        )
     try:
         for name in ("manifest.json", *_DOCUMENTS):  # the manifest first: what is half deleted must not look complete
             (folder / name).unlink(missing_ok=True)
@@ -63,6 +68,16 @@ def clear_dataset(folder: Path) -> None:
         shutil.rmtree(folder / WORK, ignore_errors=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error
+
+
+def _foreign(folder: Path, splits: list[Path]) -> Path | None:
+    """Return a file that --force must not delete and that would be in the way, if there is one."""
+    known = {*_DOCUMENTS, WORK, *(split.name for split in splits)}
+    candidates = [path for path in folder.iterdir() if path.name not in known]
+    for split in splits:
+        if split.is_dir():
+            candidates += [path for path in split.iterdir() if not path.match("shard-*.*")]
+    return min(candidates, default=None)
 
 
 def _difference(found: DatasetPlan, wanted: DatasetPlan) -> str:

@@ -1,4 +1,4 @@
-"""Where a motion is looked at: phases that are a time step apart, and many near both ends."""
+"""Where a motion is looked at: a time step apart, in every span of its splines, and densely near both ends."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -6,13 +6,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.trajectory.spline import basis, clamped_knots
+from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
 
 FEWEST, MOST = 200, 200_000  # samples of a motion
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
-CELLS = 4096  # of the table of times
+CELLS = 4096  # of equal size in the table of times
+PER_SPAN = 4  # samples between two knots, evenly in phase
 AT_ENDS = 64  # additional samples at each end
 END = 0.05  # how far from each end they reach, in phase
 
@@ -31,53 +32,43 @@ class Samples:
 
     def integral(self, values: Array) -> float:
         """Integrate samples of shape (K,) over time by the trapezoidal rule."""
-        return float(np.trapezoid(values, self.t))
-
-
-def is_positive(rate: Array, degree: int) -> bool:
-    """Whether r(s) > 0 for every s in [0, 1].
-
-    A B-spline lies in the hull of its control points; where some are not positive its roots decide.
-
-    Args:
-        rate: Control points of r [1/s], shape (R,).
-        degree: Its degree.
-    """
-    if np.all(rate > 0):
-        return True
-    if rate[0] <= 0 or rate[-1] <= 0:
-        return False
-    from scipy.interpolate import BSpline, PPoly
-
-    curve = BSpline(clamped_knots(len(rate), degree), rate / np.abs(rate).max(), degree)
-    roots = np.asarray(PPoly.from_spline(curve).roots(extrapolate=False))
-    return roots.size == 0 and bool(np.all(_nodes(len(rate), degree) @ rate > 0))
+        return float(np.diff(self.t) @ (values[1:] + values[:-1])) / 2
 
 
 def time_table(rate: Array, degree: int) -> Array:
-    """Times at the phases ``linspace(0, 1, CELLS + 1)`` [s], by a two-point Gauss rule in each cell.
+    """Times at the table's phases [s], by a two-point Gauss rule between each two of them.
 
     Args:
         rate: Control points of r [1/s], shape (R,), of a positive r.
         degree: Its degree.
 
     Returns:
-        Shape (CELLS + 1,): ascending from 0 to the duration.
+        Shape (len(table_phases()),), ascending from 0 to the duration.
     """
     inverse = 1.0 / (_nodes(len(rate), degree) @ rate)
-    cells = inverse.reshape(CELLS, 2).sum(axis=1) / (2 * CELLS)
+    cells = inverse.reshape(-1, 2).sum(axis=1) * np.diff(table_phases()) / 2
     return np.concatenate([[0.0], np.cumsum(cells)])
 
 
-def sample(table: Array, step: float) -> Samples | None:
-    """Choose samples that are at most ``step`` apart, at least ``FEWEST``, and ``AT_ENDS`` more near each end.
+@cache
+def table_phases() -> Array:
+    """Phases between which 1 / r is smooth: even ones, and geometric ones near the ends, where r may be almost 0."""
+    near = np.geomspace(1e-9, 12 / CELLS, 160)
+    return np.unique(np.concatenate([np.linspace(0, 1, CELLS + 1), near, 1 - near]))
 
-    The basis functions of r that are clamped at its ends are about 0.01 wide in phase: what they hide between the time
-    steps of a fast motion, the additional samples find. They are spaced quadratically, from 1e-5 on.
+
+def sample(table: Array, step: float, spans: int) -> Samples | None:
+    """Choose samples that are at most ``step`` apart and see everything that a B-spline can do.
+
+    * Times, at least ``FEWEST``, no more than ``step`` apart.
+    * Phases, ``PER_SPAN`` in every span: a large r could leap over a part of the path between two time steps.
+    * ``AT_ENDS`` phases near each end, spaced quadratically from 1e-5 on: the basis functions that are clamped there
+      are about 0.01 wide, and what they hide between the time steps of a fast motion is found here.
 
     Args:
         table: What ``time_table`` returned.
         step: Time step [s].
+        spans: Number of intervals between the knots of the finer spline.
 
     Returns:
         The samples, or None if the motion is too long for ``MOST`` of them.
@@ -86,16 +77,17 @@ def sample(table: Array, step: float) -> Samples | None:
     if not duration < step * MOST / SPARE:
         return None
     count = max(FEWEST, int(np.ceil(SPARE * duration / step)) + 1)
-    phases = np.linspace(0, 1, CELLS + 1)
-    even = np.interp(np.linspace(0, duration, count), table, phases)
+    phases = table_phases()
+    by_time = np.interp(np.linspace(0, duration, count), table, phases)
     near = END * (np.arange(AT_ENDS + 1) / AT_ENDS) ** 2
-    s = np.unique(np.concatenate([[0.0, 1.0], np.clip(even, 0, 1), near, 1 - near]))
+    s = np.unique(np.concatenate([by_time, np.linspace(0, 1, PER_SPAN * spans + 1), near, 1 - near]))
     return Samples(s, np.interp(s, phases, table))
 
 
 @cache
 def _nodes(points: int, degree: int) -> Array:
-    """Basis of r at the Gauss nodes of the table's cells, shape (2 CELLS, R)."""
-    middle = (np.arange(CELLS) + 0.5) / CELLS
-    offset = np.sqrt(1 / 3) / (2 * CELLS)
+    """Basis of r at the Gauss nodes of the table's cells, shape (2 cells, R)."""
+    phases = table_phases()
+    middle, half = (phases[1:] + phases[:-1]) / 2, np.diff(phases) / 2
+    offset = half / np.sqrt(3)
     return basis(np.stack([middle - offset, middle + offset], axis=1).ravel(), points, degree)

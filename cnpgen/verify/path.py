@@ -101,19 +101,26 @@ class PathWorld:
         """Linear accelerations of the tip [m/s^2], shape (3, K)."""
         return self._moving_tip()[1]
 
-    def _moving_tip(self) -> tuple[Array, Array]:
-        import pinocchio as pin
+    def tip_velocity_at(self, k: int) -> Array:
+        """Linear velocity of the tip at one of the states [m/s], shape (3,)."""
+        return self._tip_motion_at(*(np.ascontiguousarray(values[:, k]) for values in (self.q, self.dq, self.ddq)))[0]
 
+    def _moving_tip(self) -> tuple[Array, Array]:
         if self._tip_motion is None:
-            model, data, tip, frame = self._model, self._data, self._tip, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            velocity, acceleration = np.empty_like(self.tip_position), np.empty_like(self.tip_position)
             states = (np.ascontiguousarray(values.T) for values in (self.q, self.dq, self.ddq))
-            for k, (q, dq, ddq) in enumerate(zip(*states, strict=True)):
-                pin.forwardKinematics(model, data, q, dq, ddq)
-                velocity[:, k] = pin.getFrameVelocity(model, data, tip, frame).linear
-                acceleration[:, k] = pin.getFrameClassicalAcceleration(model, data, tip, frame).linear
+            found = np.array([self._tip_motion_at(*state) for state in zip(*states, strict=True)])
+            velocity, acceleration = np.ascontiguousarray(found.transpose(1, 2, 0))
             self._tip_motion = velocity, acceleration
         return self._tip_motion
+
+    def _tip_motion_at(self, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
+        """Velocity [m/s] and acceleration [m/s^2] of the tip at one state, each of shape (3,)."""
+        import pinocchio as pin
+
+        model, data, tip, frame = self._model, self._data, self._tip, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        pin.forwardKinematics(model, data, q, dq, ddq)
+        velocity = np.array(pin.getFrameVelocity(model, data, tip, frame).linear)
+        return velocity, np.array(pin.getFrameClassicalAcceleration(model, data, tip, frame).linear)
 
     def segment_distances(self) -> list[Array]:
         """Measure how far every segment of the robot's skeleton is from every obstacle, segment by segment [m].
@@ -121,15 +128,14 @@ class PathWorld:
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
         """
-        skeleton, origins = self.robot.skeleton, self._joint_origins()
-        if not np.all(np.isfinite(origins)):
-            return self._unknown(len(skeleton) * self._n_boxes)
+        segments = self.segments()
+        if not np.all(np.isfinite(segments)):
+            return self._unknown(len(segments) * self._n_boxes)
 
         def measure(segment: Array, k: int) -> list[float]:
             a, b = segment[..., k].tolist()
             return self._segment_scene.segment_distances([(a, b)])
 
-        segments = [origins[list(pair)] for pair in skeleton]
         travel = np.array([travel_of(segment) for segment in segments])
         return self._swept([partial(measure, segment) for segment in segments], travel, floor=0.0)
 
@@ -166,20 +172,21 @@ class PathWorld:
         offsets = _CORNERS * np.array(self._object_size)
         return np.asarray(np.tensordot(offsets, self.tip_rotation, axes=(1, 1)) + self.tip_position)
 
-    def _joint_origins(self) -> Array:
-        """Origins of all joints, then the tip [m], shape (n + 1, 3, K)."""
+    def segments(self) -> Array:
+        """Compute both ends of every segment of the robot's skeleton [m], shape (segments, 2, 3, K)."""
         import pinocchio as pin
 
         move, model, data, n = pin.forwardKinematics, self._model, self._data, self.robot.n
         used = sorted({point for segment in self.robot.skeleton for point in segment} - {n})
         poses = [(joint, data.oMi[joint + 1]) for joint in used]  # references: they follow the kinematics
         origins = np.zeros((self.q.shape[1], n + 1, 3))
+        origins[:, n] = self.tip_position.T
         for state, found in zip(np.ascontiguousarray(self.q.T), origins, strict=True):
             move(model, data, state)
             for joint, pose in poses:
                 found[joint] = pose.translation
-        origins[:, n] = self.tip_position.T
-        return origins.transpose(1, 2, 0)
+        pairs = np.array(self.robot.skeleton, np.int64).reshape(-1, 2)
+        return origins.transpose(1, 2, 0)[pairs]
 
     def _unknown(self, count: int) -> list[Array]:
         return [np.full(self.q.shape[1], np.nan) for _ in range(count)]

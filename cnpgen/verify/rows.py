@@ -188,5 +188,5 @@ def _judge_hit(block: _Block, columns: dict[str, Array], finite: Index, dtype: s
         return judge(name, unit, violation=np.abs(error), allowed=allowed, row=rows, end=np.ones(len(rows), np.int64))
 
     direction = np.arctan2(across, along)[moving]
-    yield judged("hit direction", "rad", direction, finite[moving], "angle")
+    yield judged("hit direction", "rad", direction, finite[moving], "direction")
     yield judged("hit speed", "m/s", along - speed, finite, "velocity")

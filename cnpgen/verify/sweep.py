@@ -60,7 +60,7 @@ def _filled(known: dict[int, list[float]], travel: Array, best: float) -> Array:
     left = np.where(states[right] == every, right, right - 1)
     from_left = measured[:, left] - (travel - travel[states[left]])
     from_right = measured[:, right] - (travel[states[right]] - travel)
-    bounds = np.maximum(np.maximum(from_left, from_right), best)
+    bounds: Array = np.maximum(np.maximum(from_left, from_right), best)
     bounds[:, states] = measured
     return bounds
 

@@ -1,0 +1,214 @@
+"""Fitting a motion to a time-sampled trajectory, so that anybody's planner can be evaluated and refined.
+
+A trajectory q(t) is many motions: any r(s) > 0 is possible, and the path p(s) that goes with it is q(t(s)). What
+differs is how well a spline of few control points follows that path. Phase proportional to time is exact for
+polynomials, but spends control points where the robot stands still; phase proportional to arc length is the opposite,
+and impossible at rest, where r would be zero. So a few mixtures of both are tried. The best of them is improved by
+least squares over log r, with the path eliminated (variable projection). The path is fitted at the phases that r really
+gives the samples: whatever r is, it costs no drift in time.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.boundary import Boundary, assemble
+from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary
+from cnpgen.trajectory.spline import basis, chebyshev, clamped_knots
+
+Array = NDArray[np.float64]
+
+MIXTURES = (0.0, 0.3, 0.6, 0.9)  # part of the arc length in the phase
+ENOUGH = 1e-6  # rad: errors below this count as equal, and the simplest r wins
+MOST = 2000  # samples that the search for r looks at
+FARTHEST = 4.0  # how much log r may change in it
+SMOOTH_PATH, SMOOTH_RATE = 1e-8, 3e-5  # weights of p''' and of second differences of log r, beside positions [rad]
+
+
+def fit_motion(
+    t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None, *, spec: TrajectorySpec, boundary: Boundary | None = None
+) -> Motion:
+    """Fit a motion to samples of one trajectory; ``largest_error`` tells how well.
+
+    Args:
+        t: Times of the samples [s], shape (K,), increasing; the motion starts at the first one.
+        q: Joint positions [rad], shape (K, n).
+        dq: Joint velocities [rad/s], shape (K, n): with them, a cubic is meant between samples.
+        spec: Degree and numbers of control points.
+        boundary: Boundary conditions of the one motion, which hold exactly; ``sampled_boundary`` by default.
+
+    Returns:
+        One motion of duration ``t[-1] - t[0]``.
+
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or something is not finite.
+    """
+    times, positions, velocities = checked_samples(t, q, dq)
+    if boundary is None:
+        boundary = sampled_boundary(times, positions, velocities)
+    _check_boundary(boundary, positions.shape[1])
+    fit = _Fit(*resampled(times - times[0], positions, velocities), times[-1] - times[0], spec, boundary)
+    rates = [fit.mixed_rate(mixture) for mixture in MIXTURES]
+    errors = [fit.error(rate) for rate in rates]
+    rate = rates[int(np.argmin(np.maximum(errors, ENOUGH)))]
+    if min(errors) > ENOUGH and len(fit.t) > spec.path_control_points:
+        rate = min(rate, fit.thinned(MOST).improved_rate(rate), key=fit.error)
+    return Motion(fit.path(rate).control[None], rate, spec.degree)
+
+
+def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
+    """Compute how far one motion is from samples at most, over all joints and samples [rad].
+
+    Args:
+        motion: One motion; it starts at the first sample.
+        t: Times of the samples [s], shape (K,).
+        q: Joint positions [rad], shape (K, n).
+    """
+    times, positions, _ = checked_samples(t, q, None)
+    return float(np.abs(motion.at(motion.phase_at(times[None] - times[0])).q[0] - positions).max())
+
+
+def _check_boundary(boundary: Boundary, n: int) -> None:
+    for name, value in vars(boundary).items():
+        if value is None:
+            continue
+        if np.shape(value) != (1, n):
+            raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {np.shape(value)}")
+        if not np.isfinite(value).all():
+            raise UsageError(f"the boundary's {name} must be finite, got {value[0]}")
+
+
+@dataclass(frozen=True)
+class _Path:
+    """The least squares for the path, given r.
+
+    Attributes:
+        s: Phases of the samples, shape (K,).
+        rows: Its matrix for all control points, shape (K + smoothing rows, C).
+        control: The control points, shape (C, n).
+        residual: Shape (K + smoothing rows, n).
+    """
+
+    s: Array
+    rows: Array
+    control: Array
+    residual: Array
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What is fitted: K samples of a trajectory that begins at t = 0. Rates are control points of shape (N, R).
+
+    Attributes:
+        t: Times [s], shape (K,).
+        q: Joint positions [rad], shape (K, n).
+        duration: Of the whole trajectory [s].
+        spec: Degree and numbers of control points.
+        boundary: Boundary conditions of one motion.
+    """
+
+    t: Array
+    q: Array
+    duration: float
+    spec: TrajectorySpec
+    boundary: Boundary
+
+    @property
+    def free(self) -> slice:
+        """The interior path control points."""
+        return slice(3, self.spec.path_control_points - self.boundary.fixed_at_goal)
+
+    def thinned(self, most: int) -> "_Fit":
+        """Leave out samples evenly until there are at most ``most``."""
+        step = -(-len(self.t) // most)
+        return _Fit(self.t[::step], self.q[::step], self.duration, self.spec, self.boundary)
+
+    def mixed_rate(self, mixture: float) -> Array:
+        """Choose r so that the phase is part arc length, the rest time; shape (1, R).
+
+        Every control point is the mean of ds/dt around its Greville abscissa: all are positive.
+        """
+        time = self.t / self.duration
+        length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.q, axis=0), axis=1)))
+        s = time + mixture * (length / length[-1] - time) if length[-1] > 0 else time
+        points, degree = self.spec.rate_control_points, self.spec.degree
+        middle = sliding_window_view(clamped_knots(points, degree)[1:-1], degree).mean(axis=1)
+        half = 0.5 / (points - degree)
+        low, high = np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
+        passed = np.interp(high, s, self.t) - np.interp(low, s, self.t)
+        return self._timed(((high - low) / passed)[None])
+
+    def improved_rate(self, rate: Array) -> Array:
+        """Minimise the squared errors over log r, beginning with a rate of shape (1, R)."""
+        from scipy.optimize import least_squares
+
+        first = np.log(rate[0])
+        bounds = first - FARTHEST, first + FARTHEST
+        found = least_squares(self._residual, first, self._jacobian, bounds, ftol=1e-4, max_nfev=40)
+        return self._timed(np.exp(found.x)[None])
+
+    def error(self, rate: Array) -> float:
+        """Largest error at the samples [rad]."""
+        return float(np.abs(self.path(rate).residual[: len(self.t)]).max())
+
+    def path(self, rate: Array) -> _Path:
+        """Fit the path for a rate of shape (1, R)."""
+        points, degree = self.spec.path_control_points, self.spec.degree
+        s = self._motion(rate).phase_at(self.t[None])[0]
+        smoothing = SMOOTH_PATH * np.sqrt(len(s)) * _third_derivative(points, degree)
+        rows = np.concatenate([basis(s, points, degree), smoothing])
+        wanted = np.concatenate([self.q, np.zeros((len(smoothing), self.q.shape[1]))])
+        control = self._fixed(rate)[0]
+        control[self.free] = np.linalg.lstsq(rows[:, self.free], wanted - rows @ control, rcond=None)[0]
+        return _Path(s, rows, control, rows @ control - wanted)
+
+    def _timed(self, rates: Array) -> Array:
+        """Scale rates so that the motions last as long as the trajectory."""
+        return rates * (self._motion(rates).duration() / self.duration)[:, None]
+
+    def _motion(self, rates: Array) -> Motion:
+        return Motion(np.zeros((len(rates), self.spec.path_control_points, 1)), rates, self.spec.degree)
+
+    def _fixed(self, rates: Array) -> Array:
+        """Path control points with the interior ones zero, shape (N, C, n)."""
+        interior = np.zeros((len(rates), self.free.stop - 3, self.q.shape[1]))
+        return assemble(self.boundary[np.zeros(len(rates), int)], interior, rates, self.spec)
+
+    def _residual(self, log_rate: Array) -> Array:
+        """Residuals of the best path, then what keeps r smooth."""
+        residual = self.path(self._timed(np.exp(log_rate)[None])).residual
+        return np.concatenate([residual.ravel(), _second_difference(len(self.t), len(log_rate)) @ log_rate])
+
+    def _jacobian(self, log_rate: Array) -> Array:
+        """Derivative of the residuals, leaving out how the projection turns (Kaufman's variable projection)."""
+        step = 1e-6
+        rate = self._timed(np.exp(log_rate)[None])
+        others = self._timed(rate * np.exp(step * np.eye(len(log_rate))))
+        path = self.path(rate)
+        speed = self._motion(rate).at(path.s).rate[0]
+        shift = (self.t - self._motion(others).time_at(path.s)) * speed / step  # of s at equal times, shape (R, K)
+        slope = basis(path.s, self.spec.path_control_points, self.spec.degree, 1) @ path.control
+        changes = np.einsum("kc,rcn->knr", path.rows, (self._fixed(others) - self._fixed(rate)) / step)
+        changes[: len(self.t)] += slope[:, :, None] * shift.T[:, None]
+        onto, _ = np.linalg.qr(path.rows[:, self.free])
+        changes -= np.tensordot(onto, np.tensordot(onto, changes, (0, 0)), 1)
+        return np.concatenate([changes.reshape(-1, len(log_rate)), _second_difference(len(self.t), len(log_rate))])
+
+
+@cache
+def _third_derivative(points: int, degree: int) -> Array:
+    """Rows of norm 1 that measure p''': they choose the smoothest path where the samples leave it open."""
+    rows = basis(chebyshev(4 * points), points, degree, 3)
+    return np.asarray(rows / np.linalg.norm(rows, 2))
+
+
+@cache
+def _second_difference(samples: int, points: int) -> Array:
+    """Rows that keep r smooth where it is a matter of taste how r and p share the motion."""
+    return np.asarray(np.diff(np.eye(points), 2, axis=0) * (SMOOTH_RATE * np.sqrt(samples)))

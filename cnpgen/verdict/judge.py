@@ -1,0 +1,178 @@
+"""Check plans with Pinocchio and Coal on a fine time grid, sharing no code with what optimised them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.constraints.table import Table
+from cnpgen.constraints.vertical import Vertical
+from cnpgen.errors import UsageError
+from cnpgen.recipes import Problem
+from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
+from cnpgen.verdict.paper import paper_rule
+from cnpgen.verdict.sampling import Samples, sample, time_table
+from cnpgen.verdict.verdict import Margin, Metrics, Reason, Verdict
+from cnpgen.verify.path import PathWorld
+
+Array = NDArray[np.float64]
+
+JERK_RATE = 5.0  # 1/s: the authors' jerk limit, reported and not constrained, is 5 x the acceleration limit
+
+
+def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
+    problem: Problem,
+    robot: Robot,
+    motion: Motion,
+    boundary: Boundary,
+    start_xyz: Array,
+    goal_xyz: Array,
+    *,
+    step: float = 1e-3,
+) -> list[Verdict]:
+    """Judge N plans, each for itself: what one of them holds changes nothing about the others.
+
+    Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
+    and at more of them near both ends. A plan is valid if it meets its boundary conditions and exceeds every bound by
+    no more than the constraint allows. Numbers that cannot be evaluated give a verdict that says so, no exception.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        motion: N motions.
+        boundary: What they must begin and end with.
+        start_xyz: Tip positions at the start [m], shape (N, 3): they say where obstacles below the object stand.
+        goal_xyz: Tip positions at the goal [m], shape (N, 3).
+        step: Time step [s].
+
+    Raises:
+        UsageError: Shapes that do not fit together, or a step that is not positive.
+    """
+    _check_shapes(robot, motion, boundary, start_xyz, goal_xyz)
+    if not 0 < step < np.inf:
+        raise UsageError(f"the time step must be positive, got {step:g} s")
+    world, tops = PathWorld(problem, robot), obstacle_tops(problem, start_xyz, goal_xyz)
+    with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
+        return [
+            _judge_plan(
+                _Plan(
+                    problem,
+                    Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
+                    boundary[i : i + 1],
+                    tops[i],
+                    goal_xyz[i],
+                ),
+                world,
+                step,
+            )
+            for i in range(len(motion))
+        ]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """One motion and what it must do.
+
+    Attributes:
+        problem: The problem.
+        motion: One motion.
+        boundary: Its boundary conditions.
+        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        goal_xyz: Where the tip must end [m], shape (3,).
+    """
+
+    problem: Problem
+    motion: Motion
+    boundary: Boundary
+    tops: Array
+    goal_xyz: Array
+
+    def is_finite(self) -> bool:
+        numbers = (self.motion.path, self.motion.rate, self.tops, self.goal_xyz, *vars(self.boundary).values())
+        return all(values is None or bool(np.all(np.isfinite(values))) for values in numbers)
+
+
+def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> None:
+    n_plans, n = len(motion), robot.n
+    wanted = {
+        "path control points": (motion.path, (n_plans, *motion.path.shape[1:2], n)),
+        "rate control points": (motion.rate, (n_plans, *motion.rate.shape[1:2])),
+        "start_xyz": (start_xyz, (n_plans, 3)),
+        "goal_xyz": (goal_xyz, (n_plans, 3)),
+        **{name: (values, (n_plans, n)) for name, values in vars(boundary).items() if values is not None},
+    }
+    for name, (values, shape) in wanted.items():
+        if np.shape(values) != shape or len(shape) < 2:
+            found = np.shape(values)
+            raise UsageError(f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {found}")
+    if min(motion.path.shape[1], motion.rate.shape[1]) <= motion.degree:
+        raise UsageError(f"splines of degree {motion.degree} need at least {motion.degree + 1} control points")
+
+
+def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
+    """Judge one plan."""
+    samples = _samples(plan, step)
+    if isinstance(samples, Verdict):
+        return samples
+    states = plan.motion.at(samples.s)
+    q, dq, ddq, jerk = (values[0].T for values in (states.q, states.dq, states.ddq, states.jerk))
+    if not np.all(np.isfinite([q, dq, ddq])):
+        return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
+    world.set_path(q, dq, ddq, plan.tops)
+    margins = [
+        *boundary_margins(states, plan.boundary, samples, world.robot.joint_names),
+        *constraint_margins(plan.problem, world, samples),
+    ]
+    return Verdict(
+        _reason(margins),
+        by_name(margins),
+        _metrics(plan.problem, world, samples, jerk),
+        paper_rule(plan.problem, world, plan.tops, plan.goal_xyz),
+        len(samples.s),
+    )
+
+
+def _samples(plan: _Plan, step: float) -> Samples | Verdict:
+    """Choose where to look, or say why there is nothing to look at."""
+    if not plan.is_finite():
+        return Verdict(Reason.NOT_FINITE)
+    if not plan.motion.runs_forward()[0]:
+        return Verdict(Reason.RATE)
+    rate, degree = plan.motion.rate[0], plan.motion.degree
+    table = time_table(rate, degree)
+    spans = max(plan.motion.path.shape[1], len(rate)) - degree
+    return sample(table, step, spans) or Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
+
+
+def _reason(margins: list[Margin]) -> str:
+    """Why a plan is not valid: its boundary conditions first, then the constraint that is broken worst."""
+    broken = [margin for margin in margins if not margin.ok]
+    if not broken:
+        return Reason.OK
+    if any(margin.reason == Reason.BOUNDARY for margin in broken):
+        return Reason.BOUNDARY
+    return max(broken, key=lambda margin: margin.severity).reason
+
+
+def _metrics(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) -> Metrics:
+    robot = world.robot
+    share = world.torque / robot.torque_limit[:, None]
+    table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
+    upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
+    return Metrics(
+        duration=float(samples.t[-1]),
+        effort=samples.integral(np.sum(share**2, axis=0)),
+        jerk=float(np.max(np.abs(jerk) / (JERK_RATE * robot.acceleration_limit[:, None]))),
+        hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
+        z_error=np.nan if table is None else samples.integral(np.abs(world.tip_position[2] - table.z)),
+        vertical_error=samples.integral(_tilt(world.tip_rotation)) if upright else np.nan,
+    )
+
+
+def _tilt(R: Array) -> Array:
+    """|roll| + |pitch| of rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` [rad], shape (3, 3, K) -> (K,)."""
+    return np.asarray(np.abs(np.arctan2(R[2, 1], R[2, 2])) + np.abs(np.arctan2(R[2, 0], np.hypot(R[2, 1], R[2, 2]))))

@@ -1,0 +1,116 @@
+"""How near one motion comes to every bound: of its boundary conditions and of the problem's constraints."""
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.constraints.constraint import Condition, Constraint
+from cnpgen.recipes import Problem
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import States
+from cnpgen.verdict.sampling import Samples
+from cnpgen.verdict.verdict import Margin, Reason
+from cnpgen.verify.path import PathWorld
+
+if TYPE_CHECKING:
+    from cnpgen.verify.world import World
+
+Array = NDArray[np.float64]
+
+# How exactly a plan must meet its boundary conditions: unit, and what is allowed. Control points rebuilt in float64
+# meet 1e-10; ones kept in float32 miss the velocity by some 1e-5 rad/s and are told so.
+BOUNDARY = {
+    "q": ("boundary position", "rad", 1e-6),
+    "dq": ("boundary velocity", "rad/s", 1e-6),
+    "ddq": ("boundary acceleration", "rad/s^2", 1e-4),
+}
+_TINY = 1e-200  # stands for an allowed excess of 0, so that the largest excess can still be found
+
+
+def boundary_margins(states: States, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:
+    """Compare the ends of a motion with its boundary conditions.
+
+    Args:
+        states: Samples of one motion, both ends among them.
+        boundary: Boundary conditions of one motion.
+        samples: When and at which phase they are.
+        joints: Names of the joints.
+    """
+    margins = []
+    for what, (name, unit, allowed) in BOUNDARY.items():
+        wanted = [getattr(boundary, f"{end}_{what}") for end in ("start", "goal")]
+        pairs = [(k, want[0]) for k, want in zip((0, -1), wanted, strict=True) if want is not None]
+        found = np.array([getattr(states, what)[0, k] for k, _ in pairs])
+        error = np.abs(found - np.array([want for _, want in pairs]))
+        end, joint = np.unravel_index(np.argmax(error), error.shape)
+        k, want = pairs[int(end)]
+        margins.append(
+            Margin(
+                name,
+                Reason.BOUNDARY,
+                unit,
+                joints[int(joint)],
+                value=float(found[end, joint]),
+                bound=float(want[joint]),
+                excess=float(error[end, joint]),
+                allowed=allowed,
+                time=float(samples.t[k]),
+                phase=float(samples.s[k]),
+            )
+        )
+    return margins
+
+
+def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> list[Margin]:
+    """Measure every constraint along a motion.
+
+    Args:
+        problem: The problem.
+        world: Its robot at the samples.
+        samples: When and at which phase they are.
+    """
+    return [
+        _margin(constraint, condition, world, samples)
+        for constraint in problem.constraint
+        for condition in constraint.measured(cast("World", world))  # the same questions, answered for K states
+        if condition.g
+    ]
+
+
+def _margin(constraint: Constraint, condition: Condition, world: PathWorld, samples: Samples) -> Margin:
+    g = np.array([np.broadcast_to(np.asarray(value, np.float64), samples.s.shape) for value in condition.g])
+    wider = constraint.funnel(condition, samples.s, world.tip_position[:, 0])
+    below, above = condition.lower[:, None] - g - wider, g - condition.upper[:, None] - wider
+    excess = np.maximum(below, above)
+    excess[np.isnan(excess)] = np.inf
+    allowed = constraint.allowed(condition)
+    part, k = np.unravel_index(np.argmax(excess / np.maximum(allowed, _TINY)[:, None]), excess.shape)
+    is_low = below[part, k] > above[part, k]
+    return Margin(
+        condition.name,
+        constraint.reason,
+        condition.unit,
+        _part(condition, int(part), world.robot.joint_names),
+        value=float(g[part, k]),
+        bound=float(condition.lower[part] - wider[k] if is_low else condition.upper[part] + wider[k]),
+        excess=float(excess[part, k]),
+        allowed=float(allowed[part]),
+        time=float(samples.t[k]),
+        phase=float(samples.s[k]),
+    )
+
+
+def _part(condition: Condition, part: int, joints: tuple[str, ...]) -> str:
+    if len(condition.g) == 1:
+        return ""
+    return joints[part] if len(condition.g) == len(joints) and condition.name.startswith("joint") else f"[{part}]"
+
+
+def by_name(margins: list[Margin]) -> dict[str, Margin]:
+    """Index margins by the names of their conditions; a name that comes again gets a number."""
+    found: dict[str, Margin] = {}
+    for margin in margins:
+        count = sum(other.name == margin.name for other in found.values())
+        found[f"{margin.name} {count + 1}" if count else margin.name] = margin
+    return found

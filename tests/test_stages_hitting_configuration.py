@@ -1,0 +1,170 @@
+"""The hitting configuration against SciPy's SLSQP, with objective, constraint and gradients by Pinocchio."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from conftest import Arm, Prepare, run_stages
+from scipy.optimize import minimize
+
+from cnpgen.kernels.tape import Loop
+from cnpgen.pipelines.hitting_configuration import basic_joints, newton_step
+from cnpgen.pipelines.ik import MAX_STEPS, TOLERANCE, ik_step
+from cnpgen.robots.robot import Robot
+
+Array = np.ndarray
+DRAWS = 40
+
+
+@dataclass
+class Search:
+    """The search for one hitting configuration: maximise |J^T d|^2 - |(q0 - q) / L|^2 subject to FK(q) = p."""
+
+    robot: Robot
+    arm: Arm
+    position: Array
+    direction: Array
+    home: Array
+
+    def value(self, q: Array) -> float:
+        gain = self.arm.jacobian(q)[:3].T @ self.direction
+        return float(gain @ gain - np.sum(((self.home - q) / self.robot.rated_velocity) ** 2))
+
+    def gradient(self, q: Array) -> Array:
+        """By d^2 p / dq_j dq_k = z_j x J_k for j <= k."""
+        jacobian = self.arm.jacobian(q)
+        second = np.cross(jacobian[3:].T[:, None], jacobian[:3].T[None]) @ self.direction
+        second = np.triu(second) + np.triu(second, 1).T
+        gain = jacobian[:3].T @ self.direction
+        return 2 * second @ gain + 2 * (self.home - q) / self.robot.rated_velocity**2
+
+    def miss(self, q: Array) -> Array:
+        return np.array(self.arm.pose(q).translation) - self.position
+
+    def slsqp(self, start: Array) -> Array | None:
+        found = minimize(
+            lambda q: -self.value(q), start, jac=lambda q: -self.gradient(q), method="SLSQP",
+            bounds=list(zip(self.robot.position_lower, self.robot.position_upper, strict=True)),
+            constraints=[{"type": "eq", "fun": self.miss, "jac": lambda q: self.arm.jacobian(q)[:3]}],
+            options={"ftol": 1e-12, "maxiter": 200},
+        )  # fmt: skip
+        return found.x if np.linalg.norm(self.miss(found.x)) < 1e-7 else None
+
+
+@pytest.fixture(scope="module", params=["airhockey-hit", "airhockey-replan"])
+def solved(request: pytest.FixtureRequest, prepare: Prepare) -> list[tuple[Search, Array, Array]]:
+    """Searches, their first guesses by inverse kinematics, and our solutions."""
+    prepared = prepare(request.param)
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    batch = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
+    n = len(batch.alive)
+    home = np.repeat(robot.base[:, None], n, axis=1) if request.param == "airhockey-hit" else batch["start_q"]
+    first = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=False, max_step=0.4)
+    guess, _ = first(home, batch["goal_xyz"])
+    angle = batch["hit_angle"][0]
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)])
+    return [
+        (Search(robot, arm, batch["goal_xyz"][:, k], direction[:, k], home[:, k]), guess[:, k], batch["goal_q"][:, k])
+        for k in range(min(n, DRAWS))
+    ]
+
+
+def other_starts(search: Search) -> Iterator[Array]:
+    """Near the configuration that the search stays close to, and anywhere."""
+    random = np.random.default_rng(42)
+    low, high = search.robot.position_lower, search.robot.position_upper
+    for _ in range(3):
+        yield np.clip(search.home + 0.7 * random.normal(size=search.robot.n), low, high)
+    yield random.uniform(low, high)
+
+
+def test_our_gradient_of_the_objective_is_right(solved):
+    search, guess, _ = solved[0]
+    step = 1e-6
+    numeric = [
+        (search.value(guess + step * e) - search.value(guess - step * e)) / (2 * step) for e in np.eye(len(guess))
+    ]
+    np.testing.assert_allclose(search.gradient(guess), numeric, atol=1e-7)
+
+
+def test_slsqp_finds_nothing_better_from_the_same_start(solved):
+    assert len(solved) == DRAWS
+    same = 0
+    for search, guess, ours in solved:
+        theirs = search.slsqp(guess)
+        if theirs is not None:
+            assert search.value(ours) >= search.value(theirs) - 1e-6, (ours, theirs, search)
+            same += bool(np.abs(ours - theirs).max() < 1e-4)
+    assert same > 0.9 * DRAWS
+
+
+def test_slsqp_finds_nothing_better_from_other_starts(solved):
+    """True of these draws; in general the maximum is a local one.
+
+    Of 620 other replanning draws, 2 have a better one elsewhere, by 0.031 and 0.00015 of 2.1, where 6 of 4512 runs of
+    SLSQP end; of 682 hits none has (4979 runs).
+    """
+    reached = 0
+    for search, _, ours in solved:
+        for start in other_starts(search):
+            theirs = search.slsqp(start)
+            if theirs is not None:
+                reached += 1
+                assert search.value(ours) >= search.value(theirs) - 1e-6, (ours, theirs, search)
+    assert reached > 3 * DRAWS
+
+
+def test_the_tip_is_at_the_puck_and_the_joints_within_their_limits(solved):
+    for search, _, ours in solved:
+        assert np.linalg.norm(search.miss(ours)) < 1e-9
+        assert np.all(search.robot.position_lower <= ours)
+        assert np.all(ours <= search.robot.position_upper)
+
+
+def test_the_projected_gradient_vanishes_and_the_projected_hessian_is_negative(solved):
+    for search, _, ours in solved:
+        jacobian = search.arm.jacobian(ours)[:3]
+        null = np.linalg.svd(jacobian)[2][3:].T
+        gradient = search.gradient(ours)
+        assert np.abs(null.T @ gradient).max() < 1e-7
+        multiplier = np.linalg.lstsq(jacobian.T, gradient, rcond=None)[0]
+
+        def slope(q, search=search, multiplier=multiplier):
+            return search.gradient(q) - search.arm.jacobian(q)[:3].T @ multiplier
+
+        hessian = [(slope(ours + 1e-6 * e) - slope(ours - 1e-6 * e)) / 2e-6 for e in np.eye(len(ours))]
+        assert np.linalg.eigvalsh(null.T @ np.array(hessian) @ null).max() < 0
+
+
+def test_the_search_improves_on_the_inverse_kinematics(solved):
+    gains = np.array([search.value(ours) - search.value(guess) for search, guess, ours in solved])
+    assert gains.min() > -1e-9
+    assert np.mean(gains > 1e-3) > 0.9
+
+
+@pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
+def test_hardly_a_draw_is_lost(prepare, name):
+    batch = run_stages(prepare(name), 20_000, seed=43, until="HittingConfiguration")
+    lost = [np.sum(batch.fate == 1 + k) for k, text in enumerate(batch.reasons) if text == "no hitting configuration"]
+    assert sum(lost) < 20
+
+
+def test_eliminated_joints_move_the_tip_in_all_directions_near_the_base(prepare):
+    robot = prepare("airhockey-hit").context.robot
+    arm, joints, random = Arm(robot), basic_joints(robot), np.random.default_rng(44)
+    for _ in range(200):
+        q = np.clip(robot.base + random.uniform(-0.5, 0.5, robot.n), robot.position_lower, robot.position_upper)
+        assert abs(np.linalg.det(arm.jacobian(q)[:3, joints])) > 1e-3
+
+
+def test_a_step_is_never_longer_than_allowed(prepare):
+    prepared = prepare("airhockey-replan")
+    batch = run_stages(prepared, 500, seed=45, until="HittingConfiguration")
+    kernel = prepared.context.kernels.load(newton_step)
+    angle = batch["hit_angle"]
+    direction = np.concatenate([np.cos(angle), np.sin(angle)])
+    following, length = kernel(batch["start_q"], batch["goal_xyz"], direction, batch["start_q"])
+    moved = np.linalg.norm(following - batch["start_q"], axis=0)
+    assert moved.max() <= 0.6 + 1e-12
+    np.testing.assert_allclose(moved, np.minimum(length[0], 0.6), rtol=1e-9)
