@@ -120,8 +120,8 @@ def direction_unmet(robot: "Robot", *, dtype: str) -> Any:
     cosine, sine = ca.cos(angle[0]), ca.sin(angle[0])
     across = ca.fabs(cosine * velocity[1] - sine * velocity[0])
     along = cosine * velocity[0] + sine * velocity[1] - speed[0]
-    exact = EXACTNESS[dtype]["velocity"]
-    met = ca.logic_and(across <= exact, ca.fabs(along) <= exact)
+    exact = EXACTNESS[dtype]
+    met = ca.logic_and(across <= exact["direction"] * speed[0] + ROUNDING, ca.fabs(along) <= exact["velocity"])
     return ca.Function("direction", [q_sx, dq_sx, angle_sx, speed_sx], [ca.logic_not(met)])
 
 

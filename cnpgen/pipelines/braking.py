@@ -59,13 +59,16 @@ class BrakingReach(Stage):
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             for end, sign in (("start", 1.0), ("goal", -1.0)):
-                excess = overshoot(tip, brake, table, batch[f"{end}_q"], sign * batch[f"{end}_dq"])
+                q, dq = batch[f"{end}_q"], sign * batch[f"{end}_dq"]
+                excess = overshoot(tip, brake, table, q, dq, margin=self.margin)
                 batch.reject(excess <= -self.margin, f"cannot brake at the {end}")
 
         return run
 
 
-def overshoot(tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array) -> NDArray[np.float64]:
+def overshoot(
+    tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array, *, margin: float = 0.0
+) -> NDArray[np.float64]:
     """How far full braking carries the tip beyond the worst edge of the table.
 
     Args:
@@ -74,15 +77,16 @@ def overshoot(tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array) -> 
         table: The table.
         q: Joint positions [rad], shape (joints, n).
         dq: Joint velocities [rad/s], reversed for the goal, shape (joints, n).
+        margin: Distance from the edges that matters [m].
 
     Returns:
-        Distance beyond the edge [m], shape (n,); -inf where a straight line stays over the table for 80 ms.
+        Distance beyond the edge [m], shape (n,); -inf where a straight line stays this far inside for 80 ms.
     """
     position, velocity = tip(q, dq)
     worst = np.full(q.shape[1], -np.inf)
     for axis, side, edge in ((0, 1, table.x.high), (0, -1, table.x.low), (1, 1, table.y.high), (1, -1, table.y.low)):
         ahead = side * (position[axis] + SUSPECT * velocity[axis] - edge)
-        suspect = np.flatnonzero((ahead > 0) & (side * velocity[axis] > 0))
+        suspect = np.flatnonzero((ahead > -margin) & (side * velocity[axis] > 0))
         if len(suspect) == 0:
             continue
         normal = np.zeros((3, len(suspect)))

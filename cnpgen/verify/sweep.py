@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Measure = Callable[[int], Sequence[float]]
 
+APART = 1e-12  # m: lower bounds stay this far above the smallest distance, so that it is found where it was measured
+
 
 def sweep(measures: Sequence[Measure], travel: Array, *, floor: float = -np.inf) -> list[Array]:
     """Find the smallest distance between M moving bodies and the obstacles without measuring every state.
@@ -26,7 +28,7 @@ def sweep(measures: Sequence[Measure], travel: Array, *, floor: float = -np.inf)
 
     Returns:
         Distances [m] per body, shape (obstacles, K). The smallest of all is exact, and so is every one at a state that
-        was measured; the others are lower bounds, none below the smallest.
+        was measured; the others are lower bounds (up to ``APART``), all above the smallest.
     """
     moved, last = travel.tolist(), travel.shape[1] - 1
     known = [{k: list(measure(k)) for k in {0, last}} for measure in measures]
@@ -60,7 +62,7 @@ def _filled(known: dict[int, list[float]], travel: Array, best: float) -> Array:
     left = np.where(states[right] == every, right, right - 1)
     from_left = measured[:, left] - (travel - travel[states[left]])
     from_right = measured[:, right] - (travel[states[right]] - travel)
-    bounds: Array = np.maximum(np.maximum(from_left, from_right), best)
+    bounds: Array = np.maximum(np.maximum(from_left, from_right), best + APART)
     bounds[:, states] = measured
     return bounds
 

@@ -1,0 +1,18 @@
+"""Plans: motions for boundary problems, and the file that they are kept in."""
+
+from cnpgen.plans.file import load_plans, save_plans
+from cnpgen.plans.plans import Plans, concatenate, make_plans, screen
+from cnpgen.plans.problem import ProblemRecord, record_problem
+from cnpgen.plans.status import PlanStatus
+
+__all__ = [
+    "PlanStatus",
+    "Plans",
+    "ProblemRecord",
+    "concatenate",
+    "load_plans",
+    "make_plans",
+    "record_problem",
+    "save_plans",
+    "screen",
+]

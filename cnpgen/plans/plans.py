@@ -1,0 +1,210 @@
+"""Plans: N motions, each for its own boundary conditions, all of one problem."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.plans.problem import ProblemRecord, record_problem
+from cnpgen.plans.status import PlanStatus
+from cnpgen.recipes import Problem
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plans:
+    """N plans of one problem with n planned joints. Values may be garbage (nan, rates below 0); shapes are right.
+
+    Attributes:
+        problem: The problem.
+        boundary: Boundary conditions, shape (N, n) each.
+        path_control_points: Control points of p(s) [rad], shape (N, C, n).
+        rate_control_points: Control points of r(s) = ds/dt [1/s], shape (N, R).
+        degree: Degree of both splines.
+        columns: What else is known of the tasks: name -> values in SI units, shape (N,) or (N, w). ``start_xyz`` and
+            ``goal_xyz``, the tip's positions in the world frame [m], shape (N, 3), are always there after
+            ``make_plans`` and ``load_plans``.
+        sample_id: Which sample of a dataset every plan is for, shape (N,).
+        status: What is known of every plan, values of ``PlanStatus``, shape (N,).
+    """
+
+    problem: ProblemRecord
+    boundary: Boundary
+    path_control_points: Array
+    rate_control_points: Array
+    degree: int
+    columns: Mapping[str, Array] = field(default_factory=dict)
+    sample_id: NDArray[np.int64]
+    status: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        mistake = next(_mistakes(self), None)
+        if mistake:
+            raise UsageError(mistake)
+
+    def __len__(self) -> int:
+        return len(self.path_control_points)
+
+    @property
+    def motion(self) -> Motion:
+        """The N motions."""
+        return Motion(self.path_control_points, self.rate_control_points, self.degree)
+
+    @cached_property
+    def duration(self) -> Array:
+        """Duration of every plan [s], shape (N,); inf or nan where there is none."""
+        return self.motion.duration()
+
+    def select(self, which: slice | NDArray[Any]) -> "Plans":
+        """Return some of the plans.
+
+        Args:
+            which: A mask of shape (N,), indices in any order, or a slice.
+        """
+        return replace(
+            self,
+            boundary=self.boundary[which],
+            path_control_points=self.path_control_points[which],
+            rate_control_points=self.rate_control_points[which],
+            columns={name: values[which] for name, values in self.columns.items()},
+            sample_id=self.sample_id[which],
+            status=self.status[which],
+        )
+
+
+def make_plans(
+    problem: Problem | ProblemRecord,
+    boundary: Boundary,
+    *,
+    path_control_points: ArrayLike,
+    rate_control_points: ArrayLike,
+    degree: int | None = None,
+    columns: Mapping[str, ArrayLike] | None = None,
+    sample_id: ArrayLike | None = None,
+    status: ArrayLike | None = None,
+) -> Plans:
+    """Put plans together; what is not given is computed.
+
+    Args:
+        problem: The problem, or its record.
+        boundary: Boundary conditions, shape (N, n) each.
+        path_control_points: Control points of p(s) [rad], shape (N, C, n).
+        rate_control_points: Control points of r(s) [1/s], shape (N, R).
+        degree: Degree of both splines; the problem's by default.
+        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz`` [m] by forward kinematics.
+        sample_id: Shape (N,); 0, 1, ... by default.
+        status: Values of ``PlanStatus``, shape (N,); unknown by default.
+
+    Raises:
+        UsageError: Something has the wrong shape.
+    """
+    record = problem if isinstance(problem, ProblemRecord) else record_problem(problem)
+    path = np.asarray(path_control_points, np.float64)
+    ids = np.arange(len(path)) if sample_id is None else sample_id
+    plans = Plans(
+        problem=record,
+        boundary=Boundary(*(None if part is None else np.asarray(part, np.float64) for part in _parts(boundary))),  # type: ignore[arg-type]
+        path_control_points=path,
+        rate_control_points=np.asarray(rate_control_points, np.float64),
+        degree=record.trajectory.degree if degree is None else degree,
+        columns={name: np.asarray(values, np.float64) for name, values in (columns or {}).items()},
+        sample_id=np.asarray(ids, np.int64),
+        status=np.zeros(len(path), np.uint8) if status is None else np.asarray(status, np.uint8),
+    )
+    ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
+    missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
+    return replace(plans, columns={**plans.columns, **missing})
+
+
+def concatenate(parts: Sequence[Plans]) -> Plans:
+    """Join plans of the same problem that have the same control points and columns.
+
+    Raises:
+        UsageError: They do not fit together.
+    """
+    if not parts:
+        raise UsageError("there are no plans to join")
+    first = parts[0]
+    for index, other in enumerate(parts[1:], 1):
+        for what, mine, its in _kinds(first, other):
+            if mine != its:
+                raise UsageError(f"plans cannot be joined: {what} is {its} in part {index}, but {mine} in part 0")
+    joined = [
+        None if first_part is None else np.concatenate([getattr(part.boundary, name) for part in parts])
+        for name, first_part in vars(first.boundary).items()
+    ]
+    return replace(
+        first,
+        boundary=Boundary(*joined),  # type: ignore[arg-type]
+        path_control_points=np.concatenate([part.path_control_points for part in parts]),
+        rate_control_points=np.concatenate([part.rate_control_points for part in parts]),
+        columns={name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns},
+        sample_id=np.concatenate([part.sample_id for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+    )
+
+
+def screen(plans: Plans) -> NDArray[np.uint8]:
+    """Find the plans that cannot be evaluated at all.
+
+    Returns:
+        Shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for the plans that can be.
+    """
+    parts = [part for part in _parts(plans.boundary) if part is not None]
+    parts += [plans.path_control_points.reshape(len(plans), -1), plans.rate_control_points]
+    finite = np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
+    found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
+    return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
+
+
+def _parts(boundary: Boundary) -> list[Array | None]:
+    return list(vars(boundary).values())
+
+
+def _kinds(first: Plans, other: Plans) -> Iterator[tuple[str, Any, Any]]:
+    """Yield what must be the same in plans that are joined."""
+    yield "the problem", first.problem.digest, other.problem.digest
+    yield "the degree", first.degree, other.degree
+    for name in ("path_control_points", "rate_control_points"):
+        yield f"the shape of a plan's {name}", getattr(first, name).shape[1:], getattr(other, name).shape[1:]
+    yield "goal_ddq", first.boundary.goal_ddq is not None, other.boundary.goal_ddq is not None
+    yield "the set of columns", sorted(first.columns), sorted(other.columns)
+    for name, values in first.columns.items():
+        yield f"the shape of column {name!r}", values.shape[1:], other.columns[name].shape[1:]
+
+
+def _mistakes(plans: Plans) -> Iterator[str]:
+    """Yield what is wrong with the shapes."""
+    path, rate, degree = plans.path_control_points, plans.rate_control_points, plans.degree
+    if path.ndim != 3:
+        yield f"path_control_points must have shape (N, C, n), got {path.shape}"
+        return
+    rows, points, n = path.shape
+    joints = len(plans.problem.joint_names)
+    if n != joints:
+        yield f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}"
+    if degree < 3:
+        yield f"the degree must be at least 3, got {degree}"
+    fewest = max(degree + 2, 3 + plans.boundary.fixed_at_goal)
+    if points < fewest:
+        yield f"path_control_points must have at least {fewest} of degree {degree}, got shape {path.shape}"
+    if rate.ndim != 2 or len(rate) != rows or rate.shape[1] <= degree:
+        yield f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}"
+    for name, values in vars(plans.boundary).items():
+        if values is not None and values.shape != (rows, n):
+            yield f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}"
+    for name in ("sample_id", "status"):
+        if getattr(plans, name).shape != (rows,):
+            yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
+    for name, values in plans.columns.items():
+        if values.ndim not in {1, 2} or len(values) != rows:
+            yield f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}"
+        elif name in {"start_xyz", "goal_xyz"} and values.shape != (rows, 3):
+            yield f"{name} must have shape {(rows, 3)}, got {values.shape}"

@@ -1,0 +1,134 @@
+"""A problem as text, so that a file of plans can be judged without any other file."""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.library import restore_dataset_recipe
+from cnpgen.recipes import Problem, TrajectorySpec, resolved
+from cnpgen.store.documents import canonical_sha256, plain
+
+Array = NDArray[np.float64]
+
+_JUDGED_BY = ("tolerance", "budget")  # of constraints: how strictly a plan is judged, not what it is a plan for
+
+
+@dataclass(frozen=True)
+class ProblemRecord:
+    """A problem as text.
+
+    Attributes:
+        recipe: The resolved problem as JSON, every number in SI.
+        urdf: The robot's URDF.
+    """
+
+    recipe: str
+    urdf: str
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """The resolved problem, as ``cnpgen.recipes.resolved`` returns it.
+
+        Raises:
+            ValueError: The text is not the JSON of a problem.
+        """
+        content = json.loads(self.recipe)
+        if not isinstance(content, dict) or not {"name", "robot", "constraint"} <= content.keys():
+            raise ValueError("the recipe is not that of a problem")
+        return content
+
+    @property
+    def name(self) -> str:
+        """Name of the problem."""
+        return str(self.content["name"])
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The n planned joints."""
+        return tuple(self.content["robot"]["joints"])
+
+    @property
+    def trajectory(self) -> TrajectorySpec:
+        """Parameterisation that the problem suggests."""
+        return TrajectorySpec(**self.content["trajectory"])
+
+    @cached_property
+    def digest(self) -> str:
+        """The sha256 over what plans of this problem mean.
+
+        Left out is what may differ between files that can be compared: name and title, the base configuration, the
+        suggested parameterisation, and by how much constraints may be violated.
+        """
+        return canonical_sha256(_meaning(self))
+
+    def differences(self, other: "ProblemRecord") -> list[str]:
+        """List the keys in which two problems differ, of those that the digest covers: ``"limits.velocity_scale"``."""
+        return list(_differences(_meaning(self), _meaning(other)))
+
+    @contextmanager
+    def restored(self) -> Iterator[Problem]:
+        """Rebuild the problem; its URDF is in a temporary folder, which is gone when the block ends.
+
+        Raises:
+            RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+        """
+        pipeline = {"name": self.name, "problem": self.content, "stage": [{"use": "at-rest"}]}
+        around = {"name": self.name, "pipeline": pipeline, "splits": {"train": 1}}  # what can be restored is datasets
+        with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+            yield restore_dataset_recipe(around, self.urdf, Path(folder)).pipeline.problem
+
+    def tip_positions(self, q: Array) -> Array:
+        """Compute where the tip is, with Pinocchio.
+
+        Args:
+            q: Joint positions [rad], shape (N, n).
+
+        Returns:
+            World frame [m], shape (N, 3).
+        """
+        import pinocchio as pin
+
+        from cnpgen.robots.robot import load_robot
+
+        with self.restored() as problem:
+            model = load_robot(problem).model
+        data, frame = model.createData(), model.getFrameId(problem.robot.tip)
+        found = np.empty((len(q), 3))
+        for row, configuration in enumerate(q):
+            pin.forwardKinematics(model, data, configuration)
+            found[row] = pin.updateFramePlacement(model, data, frame).translation
+        return found
+
+
+def record_problem(problem: Problem) -> ProblemRecord:
+    """Write a problem and its URDF down."""
+    recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
+    return ProblemRecord(recipe, problem.urdf_path.read_bytes().decode())
+
+
+def _meaning(record: ProblemRecord) -> dict[str, Any]:
+    """Reduce a problem to what its plans mean."""
+    kept = {key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory"}}
+    robot = {key: value for key, value in kept["robot"].items() if key not in {"urdf", "base"}}
+    robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
+    constraints = {
+        kind["use"]: {key: value for key, value in kind.items() if key not in _JUDGED_BY} for kind in kept["constraint"]
+    }
+    return kept | {"robot": robot, "constraint": constraints}
+
+
+def _differences(one: Any, other: Any, key: str = "") -> Iterator[str]:
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for name in [*one, *(name for name in other if name not in one)]:
+            yield from _differences(one.get(name), other.get(name), f"{key}.{name}" if key else name)
+    elif one != other:
+        yield key
