@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from common import arguments, median, progress, report, table, verdict
-
-from cnpgen.store.plan import default_shard_size
+from watching import MARKS, Sample, watch
 
 STEPS = (  # cumulative: what a process does before the first row, and what each step adds
     ("Python", "pass"),
@@ -34,7 +33,6 @@ STEPS = (  # cumulative: what a process does before the first row, and what each
     ("2 workers", "Parallel(n_jobs=2)(delayed(abs)(i) for i in range(2))"),
     ("cnpgen in workers", "Parallel(n_jobs=2)(delayed(cnpgen.make.plan_dataset)(recipe, {out!r}) for i in range(2))"),
 )
-MARKS = (0.1, 0.5, 1.0)
 
 
 @dataclass
@@ -167,71 +165,12 @@ def start_table(name: str, steps: list[tuple[str, float]]) -> str:
     return table(f"Start-up of {name}, warm: wall time that each step adds (median)", ("step", "ms"), rows)
 
 
-@dataclass
-class Sample:
-    """Memory of the processes of a run at one moment.
-
-    Attributes:
-        done: Share of the rows that are there.
-        seconds: Time since the start [s].
-        peaks: Process id -> ("maker" or "worker", peak of its resident memory [MiB], resident memory now [MiB]).
-    """
-
-    done: float
-    seconds: float
-    peaks: dict[int, tuple[str, float, float]]
-
-
-def watch(process: "subprocess.Popen[bytes]", out: Path, rows: int) -> list[Sample]:
-    """Sample a run until it ends; return the moments when ``MARKS`` were reached, the last one just before the end."""
-    start, found, latest = time.perf_counter(), [], Sample(0.0, 0.0, {})
-    while process.poll() is None:
-        peaks = memory(process.pid)
-        if any(kind == "worker" for kind, _, _ in peaks.values()):
-            latest = Sample(committed(out, rows) / rows, time.perf_counter() - start, peaks)
-        if len(found) < len(MARKS) - 1 and latest.done >= MARKS[len(found)]:
-            found.append(latest)
-            progress(f"{latest.done:.0%} after {latest.seconds:.1f} s")
-        time.sleep(0.05)
-    return [*found, latest]
-
-
-def committed(out: Path, rows: int) -> int:
-    """Count the rows of the shards that are there, as if all were of full size."""
-    return min(len(list(out.glob("*/shard-*.json"))) * default_shard_size(rows), rows)
-
-
-def memory(pid: int) -> dict[int, tuple[str, float, float]]:
-    """Read the memory of a process and of its workers."""
-    found = {}
-    for child in (pid, *children(pid)):
-        try:
-            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8", errors="replace")
-            status = dict(line.split(":", 1) for line in Path(f"/proc/{child}/status").read_text().splitlines())
-            sizes = [int(status[name].split()[0]) / 1024 for name in ("VmHWM", "VmRSS")]
-        except (OSError, KeyError, ValueError):
-            continue  # it has just ended
-        kind = "maker" if child == pid else "worker" if "popen_loky" in command else "other"
-        if kind != "other":
-            found[child] = (kind, sizes[0], sizes[1])
-    return found
-
-
-def children(pid: int) -> list[int]:
-    """List the children of a process and theirs."""
-    try:
-        text = "".join(path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children"))
-    except OSError:
-        return []
-    direct = [int(word) for word in text.split()]
-    return [*direct, *(grandchild for child in direct for grandchild in children(child))]
-
-
 def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
     """Make a large dataset once; return its wall time [s] and its samples."""
+    Case("airhockey-replan", 1000, 1, True).run(folder)  # fills the cache
     out = folder / "large"
-    start = time.perf_counter()
     command = make_command("airhockey-replan", rows, 2, out)
+    start = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment(folder / "cache")) as process:
         samples = watch(process, out, rows)
     if process.returncode:

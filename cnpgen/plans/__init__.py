@@ -1,8 +1,9 @@
 """Plans: motions for boundary problems, and the file that they are kept in."""
 
-from cnpgen.plans.file import load_plans, save_plans
+from cnpgen.plans.load import load_plans
 from cnpgen.plans.plans import Plans, concatenate, make_plans, screen
 from cnpgen.plans.problem import ProblemRecord, record_problem
+from cnpgen.plans.save import save_plans
 from cnpgen.plans.status import PlanStatus
 
 __all__ = [

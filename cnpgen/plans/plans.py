@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.plans.layout import FLOATS, INTEGERS
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
@@ -203,7 +204,13 @@ def _mistakes(plans: Plans) -> Iterator[str]:
     for name in ("sample_id", "status"):
         if getattr(plans, name).shape != (rows,):
             yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
+    yield from _column_mistakes(plans, rows)
+
+
+def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
     for name, values in plans.columns.items():
+        if name in {*FLOATS, *INTEGERS} or "/" in name or not name:
+            yield f"a column cannot be called {name!r}"
         if values.ndim not in {1, 2} or len(values) != rows:
             yield f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}"
         elif name in {"start_xyz", "goal_xyz"} and values.shape != (rows, 3):

@@ -103,7 +103,7 @@ class StoredDataset:
         return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.plan.dtype))
 
 
-def open_dataset(folder: Path, *, allow_partial: bool = False) -> StoredDataset:
+def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDataset:
     """Open a dataset for reading.
 
     Args:
@@ -114,6 +114,7 @@ def open_dataset(folder: Path, *, allow_partial: bool = False) -> StoredDataset:
         DatasetError: There is no dataset, it is unfinished, or its plan or manifest is damaged.
         MachineError: The system would not let us read something.
     """
+    folder = Path(folder)
     plan = load_plan(folder)
     if (folder / MANIFEST).exists():
         manifest = load_manifest(folder)

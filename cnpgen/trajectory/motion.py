@@ -119,7 +119,7 @@ class Motion:
         with np.errstate(all="ignore"):
             t = np.clip(t, 0.0, known[:, -1:])
             found = [np.searchsorted(row, times, side="right") for row, times in zip(known, t, strict=True)]
-            cell = np.clip(np.array(found).reshape(t.shape) - 1, 0, len(edges) - 2)
+            cell = np.clip(np.array(found, np.intp).reshape(t.shape) - 1, 0, len(edges) - 2)
             low, width = edges[cell], np.diff(edges)[cell]
             rate, offset = pick(pieces(self.rate, self.degree), low + width / 2)
             offset = offset - width / 2

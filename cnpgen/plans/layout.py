@@ -1,0 +1,38 @@
+"""What a plan file holds: names, units and meanings of its datasets (docs/plan-format.md)."""
+
+from dataclasses import replace
+
+from cnpgen.fields import Field
+
+FORMAT = "cnpgen-plans"
+FORMAT_VERSION = 1
+
+BOUNDARY = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
+
+FLOATS = (*REQUIRED, "goal_ddq", "duration")
+INTEGERS = ("sample_id", "status")
+
+_UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "xyz": "m"}
+_MEANINGS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}
+_OTHERS = (
+    Field("path_control_points", "rad", "control points of the path p(s)"),
+    Field("rate_control_points", "1/s", "control points of the rate r(s) = ds/dt"),
+    Field("duration", "s", "integral of 1 / r(s)", role="diagnostic"),
+    Field("sample_id", "1", "index of the sample in its split", role="diagnostic"),
+    Field("status", "1", "what is known of the plan", role="diagnostic"),
+    Field("hit_angle", "rad", "direction of the hit about world z, from world x", role="context", frame="world"),
+    Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
+)
+
+
+def plan_fields(joints: tuple[str, ...]) -> dict[str, Field]:
+    """Describe the datasets that have a fixed meaning."""
+    fields = {item.name: item for item in _OTHERS}
+    for end, goal in (("start", "the start"), ("goal", "the goal")):
+        for what, unit in _UNITS.items():
+            axes, frame = (("x", "y", "z"), "world") if what == "xyz" else (joints, "")
+            name = f"{end}_{what}"
+            fields[name] = Field(name, unit, f"{_MEANINGS[what]} at {goal}", len(axes), axes, frame=frame)
+    fields["path_control_points"] = replace(fields["path_control_points"], names=joints)
+    return fields

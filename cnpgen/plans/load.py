@@ -1,0 +1,162 @@
+"""Reading plan files: names, shapes and types are checked, values are not."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
+from cnpgen.library import load_problem
+from cnpgen.plans.layout import BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, REQUIRED
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.problem import ProblemRecord, record_problem
+from cnpgen.plans.status import PlanStatus
+from cnpgen.recipes import Problem
+from cnpgen.store.shard import _opened as opened_hdf5
+from cnpgen.trajectory.boundary import Boundary
+
+
+def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None) -> Plans:
+    """Read plans from a file that cnpgen or anybody else has written.
+
+    Names, shapes and types must be right. Values need not be: every plan is judged for itself, later.
+
+    Args:
+        path: The file.
+        problem: The problem that the plans must be for, by name, path or as loaded. Tolerances may differ from those
+            in the file; those given here count.
+
+    Raises:
+        DatasetError: The file is missing, damaged, not one of plans, or of another problem.
+        RecipeError: ``problem`` has mistakes, or the file needs a plug-in that is not installed.
+        MachineError: The system would not let us read it.
+    """
+    path = Path(path)
+    wanted = None if problem is None else record_problem(_loaded(problem))
+    with opened_hdf5(path) as file:
+        attributes = dict(file.attrs)
+        _check_format(path, attributes)
+        columns = {name: _read(path, item) for name, item in file.items() if hasattr(item, "dtype")}
+        if "status" in columns:
+            columns["status"] = _statuses(path, columns["status"], dict(file["status"].attrs))
+    missing = [name + nearest(name, columns.keys() - set(REQUIRED)) for name in REQUIRED if name not in columns]
+    if missing:
+        raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
+    record = _record(path, attributes, wanted)
+    try:
+        return _assembled(path, record, columns, attributes)
+    except UsageError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _loaded(problem: str | Path | Problem) -> Problem:
+    return problem if isinstance(problem, Problem) else load_problem(problem)
+
+
+def _read(path: Path, dataset: Any) -> NDArray[Any]:
+    """Read a dataset in the type that it must have."""
+    name = dataset.name.lstrip("/")
+    what, kinds = ("integers", "iu") if name in INTEGERS else ("floats", "f") if name in FLOATS else ("numbers", "fiu")
+    if dataset.dtype.kind not in kinds:
+        raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
+    return np.asarray(dataset[()], np.int64 if name in INTEGERS else np.float64)
+
+
+def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:
+    """Refuse files that say that they are something else."""
+    if "format" in attributes and _text(path, attributes, "format") != FORMAT:
+        raise DatasetError(f"{path} is a {_text(path, attributes, 'format')} file, not one of plans ({FORMAT})")
+    version = _number(path, attributes, "format_version", FORMAT_VERSION)
+    if version > FORMAT_VERSION:
+        raise DatasetError(f"{path} has format version {version}, this cnpgen reads {FORMAT_VERSION}: upgrade cnpgen")
+
+
+def _text(path: Path, attributes: Mapping[str, Any], name: str) -> str:
+    value = attributes[name]
+    if isinstance(value, bytes):
+        try:
+            return value.decode()
+        except UnicodeDecodeError as error:
+            raise DatasetError(f"{path} is damaged: its attribute {name!r} is no text") from error
+    if not isinstance(value, str):
+        raise DatasetError(f"{path}: the attribute {name!r} must be a text, got {value!r}")
+    return value
+
+
+def _number(path: Path, attributes: Mapping[str, Any], name: str, default: int) -> int:
+    value = attributes.get(name, default)
+    if np.ndim(value) or not np.issubdtype(np.asarray(value).dtype, np.integer):
+        raise DatasetError(f"{path}: the attribute {name!r} must be an integer, got {value!r}")
+    return int(value)
+
+
+def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | None) -> ProblemRecord:
+    """Find out which problem the plans are for."""
+    if "problem_recipe" in attributes:
+        found = _stored_record(path, attributes)
+    elif "problem" in attributes:
+        name = _text(path, attributes, "problem")
+        try:
+            found = record_problem(load_problem(name, relative_to=path.parent))
+        except RecipeError as error:
+            raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
+    elif wanted is None:
+        raise DatasetError(f"{path} does not say its problem: set the attribute 'problem', or pass problem=...")
+    else:
+        return wanted
+    if wanted is not None and found.digest != wanted.digest:
+        where = ", ".join(found.differences(wanted)[:4])
+        raise DatasetError(
+            f"{path} has plans of problem {found.name!r}, not of {wanted.name!r}: they differ in {where}"
+        )
+    return wanted or found
+
+
+def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
+    """Return the problem that the file holds as text."""
+    missing = [name for name in ("problem_urdf", "problem_sha256") if name not in attributes]
+    if missing:
+        raise DatasetError(f"{path} has an attribute 'problem_recipe' but no {' and no '.join(missing)}")
+    record = ProblemRecord(_text(path, attributes, "problem_recipe"), _text(path, attributes, "problem_urdf"))
+    try:
+        same = record.digest == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DatasetError(f"{path} is damaged: its problem_recipe is not that of a problem: {error}") from error
+    if not same:
+        raise DatasetError(f"{path} is damaged: its problem was changed after it was written")
+    return record
+
+
+def _assembled(
+    path: Path, record: ProblemRecord, columns: dict[str, NDArray[Any]], attributes: Mapping[str, Any]
+) -> Plans:
+    """Put the plans together."""
+    boundary = [columns.pop(name, None) for name in (*BOUNDARY, "goal_ddq")]
+    points = columns.pop("path_control_points")
+    duration = columns.pop("duration", None)  # stored for others; r decides
+    if duration is not None and duration.shape != points.shape[:1]:
+        raise UsageError(f"duration must have shape {points.shape[:1]}, got {duration.shape}")
+    return make_plans(
+        record,
+        Boundary(*boundary),  # type: ignore[arg-type]
+        path_control_points=points,
+        rate_control_points=columns.pop("rate_control_points"),
+        degree=_number(path, attributes, "degree", record.trajectory.degree),
+        sample_id=columns.pop("sample_id", None),
+        status=columns.pop("status", None),
+        columns=columns,
+    )
+
+
+def _statuses(path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]) -> NDArray[np.uint8]:
+    """Translate the file's numbers by the names that it gives them; what is not known here is UNKNOWN."""
+    known = {int(status): status for status in PlanStatus}
+    if "flag_values" in attributes and "flag_meanings" in attributes:
+        names = {status.name.lower(): status for status in PlanStatus}
+        words = _text(path, attributes, "flag_meanings").split()
+        values = np.ravel(attributes["flag_values"]).tolist()
+        known = {value: names.get(word, PlanStatus.UNKNOWN) for value, word in zip(values, words, strict=False)}
+    found = [known.get(value, PlanStatus.UNKNOWN) for value in stored.ravel().tolist()]
+    return np.array(found, np.uint8).reshape(stored.shape)

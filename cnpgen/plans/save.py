@@ -1,0 +1,77 @@
+"""Writing plan files: HDF5 with one dataset per field, and the whole problem in its attributes."""
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, plan_fields
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.status import PlanStatus
+from cnpgen.store.files import write_file
+from cnpgen.store.shard import _create as create_hdf5
+from cnpgen.store.shard import field_attributes
+
+
+def save_plans(path: str | Path, plans: Plans) -> None:
+    """Write plans to a file, atomically; equal plans give equal bytes.
+
+    Args:
+        path: Where to; a file that is there is replaced.
+        plans: The plans.
+
+    Raises:
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    import h5py
+
+    buffer = io.BytesIO()
+    fields = plan_fields(plans.problem.joint_names)
+    with h5py.File(create_hdf5(buffer)) as file:
+        for name, values in _datasets(plans).items():
+            dataset = file.create_dataset(name, data=values, track_times=False)
+            _write_attributes(dataset, field_attributes(fields[name]) if name in fields else {})
+        file["status"].attrs["flag_values"] = np.array(list(PlanStatus), np.uint8)
+        _write_attributes(file["status"], {"flag_meanings": " ".join(status.name.lower() for status in PlanStatus)})
+        _write_attributes(file, _attributes(plans))
+    write_file(Path(path), buffer.getvalue())
+
+
+def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
+    """Return everything that is stored, in order and in its stored type."""
+    floats = {name: getattr(plans.boundary, name) for name in BOUNDARY}
+    if plans.boundary.goal_ddq is not None:
+        floats["goal_ddq"] = plans.boundary.goal_ddq
+    floats |= dict(sorted(plans.columns.items()))
+    floats |= {"path_control_points": plans.path_control_points, "rate_control_points": plans.rate_control_points}
+    floats["duration"] = plans.duration
+    stored: dict[str, NDArray[Any]] = {name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()}
+    return stored | {"sample_id": plans.sample_id.astype("<i8"), "status": plans.status.astype("u1")}
+
+
+def _attributes(plans: Plans) -> dict[str, str | int]:
+    record = plans.problem
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "degree": plans.degree,
+        "problem": record.name,
+        "problem_recipe": record.recipe,
+        "problem_urdf": record.urdf,
+        "problem_sha256": record.digest,
+    }
+
+
+def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
+    """Write attributes; texts with a fixed length: those of variable length can make HDF5 hang on damaged files."""
+    import h5py
+
+    for name, value in attributes.items():
+        if not isinstance(value, str):
+            item.attrs[name] = value
+        elif value not in {"", "[]"}:
+            data = value.encode()
+            item.attrs[name] = np.array(data, h5py.string_dtype("utf-8", len(data)))

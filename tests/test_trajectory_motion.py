@@ -1,0 +1,170 @@
+"""Motions in time: derivatives by finite differences, durations by quadrature, phases by their inverse."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.interpolate import BSpline
+
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
+from cnpgen.trajectory.motion import Motion, States
+from cnpgen.trajectory.spline import clamped_knots
+
+FIELDS = tuple(States.__annotations__)
+
+
+def draw_motion(seed: int, *, n: int = 4, spread: float = 0.4, degree: int = 7, joints: int = 3) -> Motion:
+    random = np.random.default_rng(seed)
+    rate = 2 * np.exp(random.normal(0, spread, (n, 20)))
+    return Motion(np.cumsum(random.normal(0, 0.2, (n, 15, joints)), axis=1), rate, degree)
+
+
+def one(motion: Motion, i: int) -> Motion:
+    return Motion(motion.path[[i]], motion.rate[[i]], motion.degree)
+
+
+@pytest.mark.parametrize(("seed", "degree"), [(0, 7), (1, 7), (2, 5)])
+def test_velocity_acceleration_and_jerk_are_derivatives_in_time(seed: int, degree: int) -> None:
+    motion = draw_motion(seed, degree=degree)
+    h = 2e-5 * motion.duration()[:, None]
+    t = np.linspace(0.05, 0.95, 41) * motion.duration()[:, None]
+    before, now, after = (motion.at(motion.phase_at(t + step)) for step in (-h, 0 * h, h))
+    for value, derivative in (("q", "dq"), ("dq", "ddq"), ("ddq", "jerk")):
+        found = (getattr(after, value) - getattr(before, value)) / (2 * h[..., None])
+        expected = getattr(now, derivative)
+        assert np.abs(found - expected).max() < 2e-6 * np.abs(expected).max()
+
+
+def test_all_motions_at_the_same_phases_and_each_at_its_own_agree() -> None:
+    motion = draw_motion(3)
+    s = np.sort(np.random.default_rng(0).uniform(size=(4, 30)), axis=1)
+    s[:, 0], s[:, -1] = 0, 1
+    own = motion.at(s)
+    for i in range(4):
+        same = one(motion, i).at(s[i])
+        for name in FIELDS:
+            expected = getattr(same, name)[0]
+            assert getattr(own, name)[i].shape == expected.shape
+            assert np.abs(getattr(own, name)[i] - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.5, 1.0, 2.0])
+def test_the_duration_is_the_integral_of_one_over_r(spread: float) -> None:
+    motion = draw_motion(4, spread=spread)
+    breaks = np.unique(np.r_[np.linspace(0, 1, 53), 0.5 ** np.arange(5, 25), 1 - 0.5 ** np.arange(5, 25)])
+    for i, found in enumerate(motion.duration()):
+        r = BSpline(clamped_knots(20, 7), motion.rate[i], 7)
+        pieces = [quad(lambda s, r=r: 1 / r(s), a, b, epsabs=0, epsrel=1e-12)[0] for a, b in pairwise(breaks)]
+        assert found == pytest.approx(sum(pieces), rel=1e-13 if spread < 0.5 else 1e-8)
+    assert np.allclose(motion.time_at(np.array([0.3, 1.0]))[:, 1], motion.duration(), rtol=1e-9)
+
+
+def test_a_slow_start_costs_the_time_that_it_takes() -> None:
+    """The first basis function is 0.01 wide: a rule with nodes on equal cells misses it by percents."""
+    rate = np.full((1, 20), 2.0)
+    rate[0, 0] = 1e-3
+    r = BSpline(clamped_knots(20, 7), rate[0], 7)
+    breaks = np.r_[0, 0.5 ** np.arange(25, 2, -1), 1]
+    expected = sum(quad(lambda s: 1 / r(s), a, b, epsrel=1e-12)[0] for a, b in pairwise(breaks))
+    assert Motion(np.zeros((1, 15, 1)), rate).duration()[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.5, 1.5])
+def test_phase_at_inverts_time_at(spread: float) -> None:
+    motion = draw_motion(5, spread=spread)
+    s = np.unique(np.r_[np.linspace(0, 1, 101), np.geomspace(1e-9, 0.01, 20), 1 - np.geomspace(1e-9, 0.01, 20)])
+    t = motion.time_at(s)
+    assert np.all(np.diff(t) > 0)
+    assert np.abs(motion.phase_at(t) - s).max() < 1e-10
+    times = np.random.default_rng(0).uniform(0, 1, (4, 200)) * motion.duration()[:, None]  # in no order
+    phases = motion.phase_at(times)
+    for i in range(4):
+        order = np.argsort(phases[i])
+        assert np.abs(one(motion, i).time_at(phases[i][order])[0] - times[i][order]).max() < 1e-9 * times.max()
+
+
+def test_times_outside_the_motion_are_its_ends() -> None:
+    motion = draw_motion(6)
+    T = motion.duration()
+    s = motion.phase_at(np.stack([-T, 0 * T, T, 2 * T, np.inf * T], axis=1))
+    assert np.array_equal(s, np.tile([0.0, 0.0, 1.0, 1.0, 1.0], (4, 1)))
+    assert motion.phase_at(np.zeros((4, 0))).shape == (4, 0)
+    assert draw_motion(0, n=0).phase_at(np.zeros((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3, 7.0])
+def test_slowing_down_from_rest_to_rest_is_exact(factor: float) -> None:
+    random = np.random.default_rng(7)
+    q, zero, spec = random.normal(size=(2, 4, 3)), np.zeros((4, 3)), TrajectorySpec()
+    boundary, rate = Boundary(q[0], zero, zero, q[1], zero, zero), np.exp(random.normal(0, 0.3, (4, 20)))
+    motion = Motion(assemble(boundary, anchor_line(boundary, rate, spec), rate, spec), rate)
+    slow = motion.slower(np.full(4, factor))
+    assert np.allclose(slow.duration(), factor * motion.duration(), rtol=1e-14)
+    s = np.linspace(0, 1, 50)
+    fast, found = motion.at(s), slow.at(s)
+    for power, name in enumerate(("q", "dq", "ddq", "jerk")):
+        expected = getattr(fast, name) / factor**power
+        assert np.abs(getattr(found, name) - expected).max() <= 1e-13 * np.abs(expected).max()
+    ends = slow.at(np.array([0.0, 1.0]))
+    assert np.abs(ends.dq).max() < 1e-11
+    assert np.abs(ends.ddq).max() < 1e-9
+    again = assemble(
+        boundary, motion.path[:, 3:-3], slow.rate, spec
+    )  # the boundary points for the new rate are the same
+    assert np.abs(again - slow.path).max() < 1e-14
+
+
+def test_motions_that_stop_or_go_back_last_for_ever() -> None:
+    rate = np.ones((7, 20))
+    rate[1] = 0
+    rate[2, 9] = -30
+    rate[3] = -1
+    rate[4, 0] = 0
+    rate[5, 10] = -0.02  # negative as a control point only
+    rate[6, 10] = np.nan
+    motion = Motion(np.zeros((7, 15, 2)), rate)
+    assert motion.runs_forward().tolist() == [True, False, False, False, False, True, False]
+    T = motion.duration()
+    assert T[[0, 5]] == pytest.approx([1.0, 1.0], rel=0.2)
+    assert np.isposinf(T[1:5]).all()
+    assert np.isnan(T[6])
+
+
+def test_a_dip_below_zero_between_any_samples_is_seen() -> None:
+    """Two spikes with a valley between them that touches -1e-6 over a phase of 1e-3."""
+    rate = np.ones((1, 20))
+    rate[0, 9:11] = -1.0
+    low, high = 0.0, 10.0
+    for _ in range(80):  # raise the valley until it just touches zero
+        middle = (low + high) / 2
+        low, high = (
+            (middle, high) if not Motion(np.zeros((1, 15, 1)), rate + middle).runs_forward()[0] else (low, middle)
+        )
+    below, above = Motion(np.zeros((1, 15, 1)), rate + low - 1e-9), Motion(np.zeros((1, 15, 1)), rate + high + 1e-9)
+    assert not below.runs_forward()[0]
+    assert above.runs_forward()[0]
+    assert below.at(np.linspace(0, 1, 1000)).rate.min() > -2e-9  # a grid of 1000 phases hardly sees it
+    assert np.isposinf(below.duration()[0])
+
+
+def test_garbage_neither_warns_nor_disturbs_the_other_motions() -> None:
+    good = draw_motion(8, n=2)
+    path, rate = np.repeat(good.path, 4, axis=0), np.repeat(good.rate, 4, axis=0)
+    path[1], path[2, 3, 1], path[3] = np.nan, np.inf, 1e300
+    rate[5], rate[6], rate[7] = 0, -np.inf, 1e200
+    motion = Motion(path, rate)
+    t = np.linspace(0, 1, 30) * good.duration()[0]
+    for s in (np.linspace(0, 1, 20), motion.phase_at(np.tile(t, (8, 1)))):
+        found = motion.at(s)
+        expected = one(good, 0).at(s if s.ndim == 1 else s[:1])
+        assert all(np.allclose(getattr(found, name)[0], getattr(expected, name)[0], rtol=1e-12) for name in FIELDS)
+    assert np.array_equal(motion.duration()[0], good.duration()[0])
+    assert np.array_equal(motion.time_at(np.linspace(0, 1, 5))[4], good.time_at(np.linspace(0, 1, 5))[1])
+    assert motion.runs_forward().tolist() == [True] * 5 + [False] * 2 + [True]
+
+
+def test_the_spec_says_degree_and_sizes() -> None:
+    assert draw_motion(9, degree=5).spec == TrajectorySpec(degree=5, path_control_points=15, rate_control_points=20)
+    assert len(draw_motion(9)) == 4

@@ -1,0 +1,120 @@
+"""Clamped uniform B-splines against SciPy's."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+from cnpgen.trajectory.spline import (
+    basis,
+    chebyshev,
+    clamped_knots,
+    end_derivatives,
+    gauss_rule,
+    graded_edges,
+    horner,
+    lowest,
+    pick,
+    pieces,
+)
+
+SIZES = [(15, 7), (20, 7), (10, 7), (30, 7), (12, 5), (7, 5), (6, 3), (4, 3)]
+
+
+def test_the_knots_are_those_of_appendix_a() -> None:
+    assert clamped_knots(15, 7).tolist() == [0.0] * 8 + [i / 8 for i in range(1, 8)] + [1.0] * 8
+    assert all(len(clamped_knots(points, degree)) == points + degree + 1 for points, degree in SIZES)
+
+
+@pytest.mark.parametrize(("points", "degree"), SIZES)
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_the_basis_is_scipy_s(points: int, degree: int, order: int) -> None:
+    random = np.random.default_rng([points, degree])
+    control, s = random.normal(size=(points, 3)), np.linspace(0, 1, 97)
+    spline = BSpline(clamped_knots(points, degree), control, degree)
+    expected = spline.derivative(order)(s) if order else spline(s)
+    found = basis(s, points, degree, order)
+    assert found.shape == (97, points)
+    assert np.abs(found @ control - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("points", "degree"), [size for size in SIZES if size[0] >= size[1] + 2])
+def test_eta_and_beta_are_the_end_derivatives_and_the_printed_eta_is_not(points: int, degree: int) -> None:
+    control = np.random.default_rng([points, degree]).normal(size=points)
+    spline = BSpline(clamped_knots(points, degree), control, degree)
+    ends = end_derivatives(points, degree)
+    for c0, c1, c2, s, sign in ((*control[:3], 0.0, 1.0), (*control[:-4:-1], 1.0, -1.0)):
+        first, second = spline.derivative(1)(s), spline.derivative(2)(s)
+        assert sign * ends.eta * (c1 - c0) == pytest.approx(first, rel=1e-12)
+        assert ends.beta * (c2 - 3 * c1 + 2 * c0) == pytest.approx(second, rel=1e-10)
+        printed = degree * (points - degree) ** 2  # Appendix A
+        assert sign * printed * (c1 - c0) == pytest.approx((points - degree) * first, rel=1e-12)
+
+
+@pytest.mark.parametrize(("points", "degree"), SIZES)
+@pytest.mark.parametrize("shape", [(), (2,)])
+def test_pieces_are_the_same_splines_each_at_its_own_phases(points: int, degree: int, shape: tuple[int, ...]) -> None:
+    random = np.random.default_rng([points, degree])
+    control = random.normal(size=(4, points, *shape))
+    knots = np.unique(clamped_knots(points, degree))
+    s = np.array([np.concatenate([knots, row, [0.0, 1.0, 1 - 1e-12]]) for row in random.uniform(size=(4, 50))])
+    picked = pick(pieces(control, degree), s)
+    for order in range(4):
+        found = horner(*picked, order)
+        expected = np.array(
+            [np.tensordot(basis(row, points, degree, order), own, 1) for row, own in zip(s, control, strict=True)]
+        )
+        inner = np.abs(s[..., None] - knots).min(axis=2) > 1e-9 if order >= degree else np.full(s.shape, True)
+        inner |= s == 0  # derivatives of order D jump at inner knots
+        assert found.shape == (4, s.shape[1], *shape)
+        assert np.abs(found - expected)[inner].max() <= 1e-11 * np.abs(expected).max()
+
+
+def test_phases_that_are_nan_give_nan_and_disturb_no_others() -> None:
+    coefficients = pieces(np.ones((1, 15)), 7)
+    found = horner(*pick(coefficients, np.array([[0.2, np.nan, 1.0]])))[0]
+    assert np.isnan(found).tolist() == [False, True, False]
+
+
+def test_the_lowest_value_is_found_between_any_samples() -> None:
+    random = np.random.default_rng(3)
+    s = np.linspace(0, 1, 20_001)
+    for _ in range(30):
+        control = random.normal(size=20)
+        sampled = float((basis(s, 20, 7) @ control).min())
+        assert sampled - 1e-5 <= lowest(control, 7) <= sampled + 1e-14
+    assert lowest(np.full(20, 0.7), 7) == pytest.approx(0.7, rel=1e-14)  # no turning points at all
+    assert lowest(np.arange(20.0) + 1, 7) == 1.0  # at an end
+
+
+def test_gauss_rule_is_exact_on_every_span() -> None:
+    s, weights = gauss_rule(20, 7)
+    values = basis(s, 20, 7)
+    squares = BSpline(clamped_knots(20, 7), np.eye(20), 7)
+    dense, more = gauss_rule(20, 7, 20)
+    assert weights.sum() == pytest.approx(1, rel=1e-14)
+    assert np.abs((values**2).T @ weights - (squares(dense) ** 2).T @ more).max() < 1e-15
+
+
+@pytest.mark.parametrize(("points", "degree"), SIZES)
+def test_graded_edges_ascend_and_contain_the_knots(points: int, degree: int) -> None:
+    edges = graded_edges(points, degree)
+    assert edges[0] == 0
+    assert edges[-1] == 1
+    assert np.all(np.diff(edges) > 0)
+    assert np.isin(np.arange(points - degree) / (points - degree), edges).all()
+
+
+def test_chebyshev_points_are_dense_at_both_ends() -> None:
+    s = chebyshev(128)
+    assert s[[0, -1]].tolist() == [0, 1]
+    assert s[1] < 2e-4
+    assert np.allclose(s + s[::-1], 1, atol=1e-15)
+
+
+def test_importing_the_trajectory_does_not_import_scipy() -> None:
+    modules = ", ".join(f"cnpgen.trajectory.{name}" for name in ("spline", "boundary", "motion", "fit", "samples"))
+    code = f"import sys, {modules}; sys.exit('scipy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
