@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-7  # m and rad, before the last (quadratically convergent) step
 MAX_STEPS = 24
 DAMPING = 1e-9
+# The step that respects the joint limits is damped by min(MOST_DAMPING, DAMPING_RATE |e|^2) as well: where the limits
+# leave hardly enough joints, an undamped step amplifies rounding until no two machines find the same solution. Damping
+# that vanishes with the error e leaves the convergence quadratic.
+MOST_DAMPING = 1e-2
+DAMPING_RATE = 1e-1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,17 +124,19 @@ def ik_step(robot: "Robot", *, vertical: bool, max_step: float) -> Any:
     if vertical:
         tilt, tilt_rows = _tilt(kin)
         error, rows = [*error, *tilt], [*rows, *tilt_rows]
-    step = _clipped(rows, error, max_step)
-    target, factor = add(q, step[0]), step[1]
+    square = dot(error, error)
+    step, factor = _clipped(rows, error, max_step, DAMPING)
+    target = add(q, step)
     free = [
         ca.logic_and(float(low) <= x, x <= float(high))
         for x, low, high in zip(target, robot.position_lower, robot.position_upper, strict=True)
     ]
     moved = [ca.if_else(ok, 0.0, _clip(x, robot, i) - q[i]) for i, (ok, x) in enumerate(zip(free, target, strict=True))]
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
-    again, _ = _clipped([[x * ok for x, ok in zip(row, free, strict=True)] for row in rows], rest, max_step)
+    left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
+    again, _ = _clipped(left, rest, max_step, DAMPING + ca.fmin(MOST_DAMPING, DAMPING_RATE * square))
     following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
-    return ca.Function("ik", [q_sx, p_sx], [ca.vertcat(*following), ca.sqrt(dot(error, error))])
+    return ca.Function("ik", [q_sx, p_sx], [ca.vertcat(*following), ca.sqrt(square)])
 
 
 def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
@@ -147,11 +154,11 @@ def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
     return [up[1] * stretch, -up[0] * stretch], rows
 
 
-def _clipped(rows: list[Vec], error: Vec, max_step: float) -> tuple[Vec, Scalar]:
+def _clipped(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) -> tuple[Vec, Scalar]:
     """Least-norm step that closes the error, shortened to ``max_step``; returns it and the factor of shortening."""
     import casadi as ca
 
-    weights = solve(gram(rows, DAMPING), error)
+    weights = solve(gram(rows, damping), error)
     columns = len(rows[0])
     step = [dot([row[j] for row in rows], weights) for j in range(columns)]
     largest: Scalar = ca.fabs(step[0])

@@ -37,10 +37,10 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     """Judge N plans, each for itself: what one of them holds changes nothing about the others.
 
     Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
-    and at more of them near both ends (``cnpgen.verdict.sampling``). A plan is valid if it meets its boundary conditions and exceeds every bound by
-    no more than the constraint allows. Numbers that cannot be evaluated give a verdict that says so, no exception.
-    What lies between two samples is not seen: where edges of object and pedestal pass each other, that was 0.06 mm at
-    1 ms.
+    and at more of them near both ends (``cnpgen.verdict.sampling``). A plan is valid if it meets its boundary
+    conditions and exceeds every bound by no more than the constraint allows. Numbers that cannot be evaluated give a
+    verdict that says so, no exception. What lies between two samples is not seen: where edges of object and pedestal
+    pass each other, that was 0.06 mm at 1 ms.
 
     Args:
         problem: The problem.
