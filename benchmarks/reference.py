@@ -170,8 +170,8 @@ def _reference_goal(
             found.compare(what, hit.objective(ours), hit.objective(best), **case)
     programme = hitting_speed(arm, sample["goal_q"], direction)
     if programme is not None:
-        ours = float(sample["hit_speed_max"][0])
-        found.compare("hitting velocity", ours, programme[1], goal_q=sample["goal_q"], d=direction)
+        speed = float(sample["hit_speed_max"][0])
+        found.compare("hitting velocity", speed, programme[1], goal_q=sample["goal_q"], d=direction)
 
 
 def _nearby(arm: Arm, hit: Hit, random: np.random.Generator) -> Array:

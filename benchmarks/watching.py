@@ -29,7 +29,8 @@ class Sample:
 
 def watch(process: "subprocess.Popen[bytes]", out: Path, rows: int) -> list[Sample]:
     """Sample a run until it ends; return the moments when ``MARKS`` were reached, the last one just before the end."""
-    start, found, latest = time.perf_counter(), [], Sample(0.0, 0.0, {})
+    start, latest = time.perf_counter(), Sample(0.0, 0.0, {})
+    found: list[Sample] = []
     while process.poll() is None:
         peaks = memory(process.pid)
         if any(kind == "worker" for kind, _, _ in peaks.values()):

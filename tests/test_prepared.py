@@ -92,15 +92,16 @@ def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[
 
 def test_a_piece_that_begins_with_a_round_counts_the_draws_rejected_at_the_end_of_the_one_before(prepare: Prepare):
     prepared = prepare("heavy-object")
-    tails = []
-    for index in range(6):
-        ends, rejected = round_ends(prepared, index)
-        tails.append(rejected[0])
-        for cut in (ends[0] - 1, ends[0], ends[0] + 1):
-            whole, (columns, outcome) = prepared.block(SEED, "train", index), pieces(prepared, [cut], index)
-            assert_same_columns(columns, whole.columns)
-            assert_same_outcome(outcome, whole.outcome)
-    assert max(tails) > 0
+    tested = 0
+    for index in range(20):
+        ends, tails = round_ends(prepared, index)
+        if tails[0] == 0 or tested == 3:
+            continue
+        tested += 1
+        whole, (columns, outcome) = prepared.block(SEED, "train", index), pieces(prepared, [ends[0]], index)
+        assert_same_columns(columns, whole.columns)
+        assert_same_outcome(outcome, whole.outcome)
+    assert tested == 3
 
 
 def test_a_shorter_block_is_the_beginning_of_a_longer_one(prepared, whole):
@@ -197,7 +198,7 @@ def test_backends_agree_on_the_same_draws(prepare: Prepare, name, backend, size)
     """But for draws on the verge of being rejected and for searches that end in another of two equal optima."""
     one, other = same_round(prepare(name, "numpy"), size), same_round(prepare(name, backend), size)
     flipped = np.setxor1d(one.alive, other.alive)
-    assert len(flipped) <= 1e-3 * size
+    assert len(flipped) <= 2
     assert set(one.reasons) == set(other.reasons)
     common = np.intersect1d(one.alive, other.alive)
     rows = [np.searchsorted(batch.alive, common) for batch in (one, other)]
@@ -251,9 +252,10 @@ def test_rows_have_the_fields_that_are_promised_in_that_order(prepared, whole):
 def test_values_are_within_the_limits_that_their_fields_state(prepared, whole):
     for field in prepared.fields:
         values = whole.columns[field.name]
-        for limit, beyond in ((field.valid_min, np.less), (field.valid_max, np.greater)):
-            if limit is not None:
-                assert not beyond(values, np.array(limit)[:, None] * (1 + 1e-15)).any(), field.name
+        if field.valid_min is not None:
+            assert np.all(values >= np.array(field.valid_min)[:, None] - 1e-14), field.name
+        if field.valid_max is not None:
+            assert np.all(values <= np.array(field.valid_max)[:, None] + 1e-14), field.name
 
 
 def test_random_numbers_depend_on_seed_split_and_block():

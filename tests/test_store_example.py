@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cnpgen.fields import Field
-from cnpgen.store.manifest import finalize
 from cnpgen.outcome import DensityMap, Outcome
+from cnpgen.store.manifest import finalize
 from cnpgen.store.plan import DatasetPlan, ShardTask, save_plan, shards
 from cnpgen.store.record import ShardRecord, commit_shard
 

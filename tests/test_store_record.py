@@ -12,8 +12,8 @@ import pytest
 from test_store_example import PLAN, make_columns, make_outcome, make_shard, make_shards
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.store.files import file_sha256
 from cnpgen.outcome import DensityMap, Outcome, merge_outcomes, outcome_from_json
+from cnpgen.store.files import file_sha256
 from cnpgen.store.plan import shards
 from cnpgen.store.record import (
     commit_shard,

@@ -14,12 +14,12 @@ import pytest
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.library import load_problem
+from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.verify import rows as rows_module
 from cnpgen.verify.report import Check, RowReport, merge
 from cnpgen.verify.rows import verify_rows
 from cnpgen.verify.scene import Scene
-from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.verify.world import World
 
 Columns = dict[str, np.ndarray]

@@ -18,7 +18,8 @@ from cnpgen.kernels.emit import PRELUDE, emit
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
 
-FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w")
+FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w")
+LONG = 6000  # instructions: above, GCC's register allocator takes minutes at -O2 and gains nothing
 COMPILE_SECONDS = 300
 
 
@@ -80,6 +81,11 @@ def target() -> str:
     return f"{platform.system()}-{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:8]}"
 
 
+def optimisation(tape: Tape) -> str:
+    """Return the level of optimisation that pays for a tape."""
+    return "-O1" if len(tape) > LONG else "-O2"
+
+
 def vector_flags() -> tuple[str, ...]:
     """Flags that let the compiler use this machine's vector instructions."""
     if platform.machine() in ("arm64", "aarch64"):
@@ -96,7 +102,7 @@ def _emitter_digest() -> str:
 def library_stem(tape: Tape, compiler: str) -> str:
     """How the file name of a tape's library begins: with everything that determines its content."""
     identity = hashlib.sha256(tape.to_bytes())
-    for text in (*FLAGS, *vector_flags(), compiler_version(compiler), target(), _emitter_digest()):
+    for text in (*FLAGS, optimisation(tape), *vector_flags(), compiler_version(compiler), target(), _emitter_digest()):
         identity.update(text.encode() + b"\0")
     return f"{tape.name}-{identity.hexdigest()[:24]}"
 
@@ -127,14 +133,14 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
         with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
             source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"
             source.write_text(emit(tape), encoding="utf-8")
-            _run_compiler(compiler, source, built)
+            _run_compiler(compiler, optimisation(tape), source, built)
             return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
     except OSError as error:
         raise MachineError(f"cannot use the kernel cache {libraries}: {error.strerror or error}") from error
 
 
-def _run_compiler(compiler: str, source: Path, built: Path) -> None:
-    command = [compiler, *FLAGS, *vector_flags(), str(source), "-o", str(built), "-lm"]
+def _run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
+    command = [compiler, *FLAGS, level, *vector_flags(), str(source), "-o", str(built), "-lm"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:

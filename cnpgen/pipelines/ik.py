@@ -18,7 +18,7 @@ from cnpgen.schema import Range, field
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-TOLERANCE = 1e-7  # m and rad, before the last (quadratically convergent) step
+TOLERANCE = 1e-9  # m and rad, before the last step (quadratically convergent, but not with joints on their limits)
 MAX_STEPS = 24
 DAMPING = 1e-9
 # The step that respects the joint limits is damped by min(MOST_DAMPING, DAMPING_RATE |e|^2) as well: where the limits

@@ -108,7 +108,7 @@ def make_plans(
     """
     record = problem if isinstance(problem, ProblemRecord) else record_problem(problem)
     path = np.asarray(path_control_points, np.float64)
-    ids = np.arange(len(path)) if sample_id is None else sample_id
+    rows = path.shape[0] if path.ndim else 0
     plans = Plans(
         problem=record,
         boundary=Boundary(*(None if part is None else np.asarray(part, np.float64) for part in _parts(boundary))),  # type: ignore[arg-type]
@@ -116,8 +116,8 @@ def make_plans(
         rate_control_points=np.asarray(rate_control_points, np.float64),
         degree=record.trajectory.degree if degree is None else degree,
         columns={name: np.asarray(values, np.float64) for name, values in (columns or {}).items()},
-        sample_id=np.asarray(ids, np.int64),
-        status=np.zeros(len(path), np.uint8) if status is None else np.asarray(status, np.uint8),
+        sample_id=np.arange(rows) if sample_id is None else np.asarray(sample_id, np.int64),
+        status=np.zeros(rows, np.uint8) if status is None else np.asarray(status, np.uint8),
     )
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
@@ -158,9 +158,9 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     Returns:
         Shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for the plans that can be.
     """
-    parts = [part for part in _parts(plans.boundary) if part is not None]
-    parts += [plans.path_control_points.reshape(len(plans), -1), plans.rate_control_points]
-    finite = np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
+    parts = [part for part in _parts(plans.boundary) if part is not None] + [plans.rate_control_points]
+    finite = np.isfinite(plans.path_control_points).all(axis=(1, 2))
+    finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
     found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
     return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
 

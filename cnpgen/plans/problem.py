@@ -81,7 +81,7 @@ class ProblemRecord:
         Raises:
             RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
         """
-        pipeline = {"name": self.name, "problem": self.content, "stage": [{"use": "at-rest"}]}
+        pipeline = {"name": self.name, "problem": self.content, "stage": [{"use": "at-rest", "end": "start"}]}
         around = {"name": self.name, "pipeline": pipeline, "splits": {"train": 1}}  # what can be restored is datasets
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
             yield restore_dataset_recipe(around, self.urdf, Path(folder)).pipeline.problem
