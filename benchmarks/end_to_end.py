@@ -21,7 +21,7 @@ from typing import Any
 from common import arguments, median, progress, report, table, verdict
 from watching import MARKS, Sample, watch
 
-STEPS = (  # cumulative: what a process does before the first row, and what each step adds
+STEPS = (  # what happens before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
     ("cnpgen.make", "import cnpgen.make"),
@@ -114,18 +114,19 @@ def measure(folder: Path, repeat: int, cold: int) -> list[Case]:
     return list(CASES)
 
 
-def measure_start(folder: Path, name: str, repeat: int) -> list[tuple[str, float]]:
-    """Time processes that do the first 1, 2, 3, ... steps of a start; return what each step adds [s]."""
-    lines = [line.format(name=name, out=str(folder / "none")) for _, line in STEPS]
-    walls: list[list[float]] = [[] for _ in STEPS]
+def measure_start(folder: Path, name: str, repeat: int) -> dict[str, float]:
+    """Run the steps of a start in a fresh process and note the time after each; return what each takes [s]."""
+    lines = [line.format(name=name, out=str(folder / "none")) + "; print(time.time())" for _, line in STEPS]
+    command = [sys.executable, "-c", "\n".join(["import time", *lines])]
+    found: list[list[float]] = []
     for _ in range(repeat):
-        for count, found in enumerate(walls, start=1):
-            start = time.perf_counter()
-            command = [sys.executable, "-c", "\n".join(lines[:count])]
-            subprocess.run(command, check=True, env=environment(folder / "cache"))
-            found.append(time.perf_counter() - start)
-    total = [median(found) for found in walls]
-    return [(step, now - before) for (step, _), now, before in zip(STEPS, total, [0.0, *total], strict=False)]
+        start = time.time()
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=environment(folder / "cache"), text=True)
+        found.append([start, *map(float, done.stdout.split())])
+    return {
+        step: median(times[number] - times[number - 1] for times in found)
+        for number, (step, _) in enumerate(STEPS, start=1)
+    }
 
 
 def case_table(cases: list[Case]) -> str:
@@ -159,10 +160,10 @@ def case_table(cases: list[Case]) -> str:
     return table("Whole processes, wall time (median)", head, rows)
 
 
-def start_table(name: str, steps: list[tuple[str, float]]) -> str:
-    rows = [(step, f"{1e3 * seconds:.0f}") for step, seconds in steps]
-    rows.append(("together", f"{1e3 * sum(seconds for _, seconds in steps):.0f}"))
-    return table(f"Start-up of {name}, warm: wall time that each step adds (median)", ("step", "ms"), rows)
+def start_table(name: str, steps: dict[str, float]) -> str:
+    rows = [(step, f"{1e3 * seconds:.0f}") for step, seconds in steps.items()]
+    rows.append(("together", f"{1e3 * sum(steps.values()):.0f}"))
+    return table(f"Start-up of {name}, warm: wall time of each step (median)", ("step", "ms"), rows)
 
 
 def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
@@ -209,7 +210,7 @@ def main() -> None:
             return
         cases = measure(folder, options.repeat, options.cold)
         steps = measure_start(folder, "airhockey-replan", options.repeat)
-    results = {"cases": [vars(case) for case in cases], "start": dict(steps)}
+    results = {"cases": [vars(case) for case in cases], "start": steps}
     report(results, [case_table(cases), start_table("airhockey-replan", steps)], as_json=options.json)
 
 

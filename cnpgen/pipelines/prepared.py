@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
+from cnpgen.constraints.constraint import EXACTNESS
+from cnpgen.errors import RecipeError, UsageError
 from cnpgen.fields import Field
 from cnpgen.kernels.library import Backend, KernelLibrary
 from cnpgen.outcome import Outcome
@@ -62,6 +63,8 @@ class PreparedPipeline:
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
+        if dtype not in EXACTNESS:
+            raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
         problem = pipeline.problem
         robot = load_robot(problem)
         kernels = KernelLibrary(backend, cache_folder, _identity(problem), {"robot": robot, "problem": problem})

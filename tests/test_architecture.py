@@ -1,0 +1,119 @@
+"""Dependencies point one way, nothing heavy is imported before it is needed, and the rim is where effects are."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "cnpgen"
+
+# Layers from the top of docs/architecture.md downwards; a module may import those of its own layer and above.
+LAYERS = (
+    ("errors", "units", "fields", "outcome"),
+    ("schema",),
+    ("constraints", "pipelines.stage"),
+    ("plugins",),
+    ("recipes", "library"),
+    ("robots",),
+    ("kernels",),
+    ("pipelines",),
+    ("store", "trajectory", "verify"),
+    ("verdict", "plans", "refine", "export", "plan_plots"),
+    ("make", "validation", "inspection", "describe", "plots", "doctor"),
+    ("cli", "__main__", "__init__"),
+)
+# What a part must not import although a layer above it may be older: the judges share no code with what they judge.
+APART = {
+    "store": ("kernels", "pipelines", "robots", "refine"),
+    "verify": ("kernels", "pipelines", "refine", "robots.symbolic", "robots.linalg", "robots.boxes"),
+    "verdict": ("kernels", "pipelines", "refine", "robots.symbolic", "robots.linalg", "robots.boxes"),
+    "trajectory": ("kernels", "pipelines", "robots", "refine", "verify"),
+}
+HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp")
+MODULES = sorted(
+    path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if "_recipes" not in path.parts
+)
+
+
+def name(module: Path) -> str:
+    parts = module.parts[:-1] if module.name == "__init__" and len(module.parts) > 1 else module.parts
+    return ".".join(parts)
+
+
+def layer(module: str) -> int:
+    best = max((prefix for row in LAYERS for prefix in row if within(module, prefix)), key=len, default=None)
+    assert best is not None, f"cnpgen.{module} is in no layer of docs/architecture.md"
+    return next(index for index, row in enumerate(LAYERS) if best in row)
+
+
+def within(module: str, prefix: str) -> bool:
+    return module == prefix or module.startswith(prefix + ".")
+
+
+def imports(module: Path, *, everywhere: bool = True) -> set[str]:
+    """Names that a module imports at run time: at its top, or also inside functions."""
+    tree = ast.parse((PACKAGE / module).with_suffix(".py").read_text(encoding="utf-8"))
+    nodes = ast.walk(tree) if everywhere else iter(tree.body)
+    typing_only = {
+        id(child)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        for child in ast.walk(node)
+    }
+    found: set[str] = set()
+    for node in nodes:
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            if node.module == "cnpgen":
+                found.update(f"cnpgen.{alias.name}" for alias in node.names)
+    return found
+
+
+@pytest.mark.parametrize("module", MODULES, ids=name)
+def test_a_module_imports_only_its_own_layer_and_those_above(module: Path) -> None:
+    own = layer(name(module))
+    for imported in imports(module):
+        target = imported.removeprefix("cnpgen.")
+        if (
+            imported.startswith("cnpgen.")
+            and (PACKAGE / target.split(".")[0]).with_suffix(".py").exists() | (PACKAGE / target.split(".")[0]).is_dir()
+        ):
+            if within(name(module), "constraints") and target == "robots.boxes":
+                continue  # the symbolic form of a constraint, built only where kernels are
+            assert layer(target) <= own, f"cnpgen.{name(module)} imports cnpgen.{target} of a later layer"
+
+
+@pytest.mark.parametrize("part", APART)
+def test_a_judge_shares_no_code_with_what_it_judges(part: str) -> None:
+    for module in MODULES:
+        if within(name(module), part):
+            for imported in imports(module):
+                target = imported.removeprefix("cnpgen.")
+                allowed = (
+                    target in {"pipelines.stage", "robots.robot", "robots.obstacles", "robots.chain"}
+                    and part != "store"
+                )
+                assert allowed or not any(within(target, apart) for apart in APART[part]), (
+                    f"{name(module)} imports {target}"
+                )
+
+
+@pytest.mark.parametrize("module", MODULES, ids=name)
+def test_no_module_imports_a_heavy_library_at_its_top(module: Path) -> None:
+    found = {imported.split(".")[0] for imported in imports(module, everywhere=False)}
+    assert not found & set(HEAVY)
+
+
+@pytest.mark.parametrize(
+    "statement", ["import cnpgen", "import cnpgen.library", "from cnpgen.cli.main import main; main(['list'])"]
+)
+def test_importing_recipes_or_listing_them_loads_nothing_heavy(statement: str) -> None:
+    code = f"{statement}\nimport sys\nprint('LOADED', *sorted(set({HEAVY!r}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "LOADED"
