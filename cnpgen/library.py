@@ -107,9 +107,12 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
 
 
 def _without_defaults(value: Any) -> Any:
-    """Leave out nulls and empty arrays: in a recipe they can only be said by leaving the key out."""
+    """Leave out nulls, empty arrays and digests of plug-ins: in a recipe they are not said."""
     if isinstance(value, dict):
-        return {key: _without_defaults(entry) for key, entry in value.items() if entry is not None and entry != []}
+        said = {key: entry for key, entry in value.items() if entry is not None and entry != []}
+        if "use" in said:
+            said.pop("source", None)
+        return {key: _without_defaults(entry) for key, entry in said.items()}
     return [_without_defaults(entry) for entry in value] if isinstance(value, list) else value
 
 

@@ -117,9 +117,12 @@ def make_dataset(
     job = plan_dataset(
         loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=not force
     )
+    if force and part is not None:
+        raise UsageError("--force would delete what the other parts have made: remove the folder, then start the parts")
     if force:
         clear_dataset(job.folder)
     open_workspace(job.folder, job.plan)
+    job = replace(job, plan=load_plan(job.folder))  # begun perhaps by another version: shards say what the plan says
     mine = _select(shards(job.plan), part)
     waiting = set(pending(job.folder, job.plan))
     tasks = [task for task in mine if task in waiting]
@@ -306,9 +309,9 @@ def worker_count(workers: int | None, tasks: int) -> int:
         UsageError: Fewer than one was asked for.
     """
     if workers is None:
-        from joblib import cpu_count
+        from joblib import effective_n_jobs
 
-        return max(1, min(int(cpu_count()), tasks))
+        return max(1, min(int(effective_n_jobs(-1)), tasks))  # of the backend that parallel_config names, if any
     if workers < 1:
         raise UsageError(f"workers must be at least 1, got {workers}")
     return max(1, min(workers, tasks))

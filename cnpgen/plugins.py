@@ -3,10 +3,13 @@
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import importlib
 import importlib.metadata
 import inspect
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from cnpgen.constraints.constraint import Constraint
@@ -99,6 +102,20 @@ def name_of(group: str, kind: type) -> str:
             if entry.value == spec or load(group, entry.name) is kind:
                 return entry.name
     return spec
+
+
+def source_digest(kind: type) -> str:
+    """Hash the source of the package that a plug-in comes from; empty for built-in kinds.
+
+    What a plug-in computes decides rows and kernels as much as its parameters do.
+    """
+    package = kind.__module__.partition(".")[0]
+    source = getattr(sys.modules.get(package), "__file__", None)
+    if package == "cnpgen" or not source:
+        return ""
+    path = Path(source)
+    files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 @functools.cache

@@ -197,8 +197,8 @@ def resolved(recipe: Problem | Pipeline | DatasetRecipe) -> dict[str, Any]:
 def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
     """Hash all that decides which rows a seed gives, and nothing else.
 
-    That is the resolved pipeline and problem and the content of the URDF: not titles, comments, paths, the seed or the
-    splits. Writing "5 mm" for 0.005 or a default explicitly does not change it.
+    That is the resolved pipeline and problem, the code of plug-ins and the content of the URDF: not titles, comments,
+    paths, the seed or the splits. Writing "5 mm" for 0.005 or a default explicitly does not change it.
 
     Returns:
         sha256, as 64 hexadecimal digits.
@@ -213,8 +213,9 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
 
 
 def _use(obj: object) -> dict[str, str]:
-    """Label a stage or a constraint with the name of its kind."""
+    """Label a stage or a constraint with the name of its kind and, for a plug-in, the digest of its code."""
     for group, base in plugins.BASES.items():
         if isinstance(obj, base):
-            return {"use": plugins.name_of(group, type(obj))}
+            source = plugins.source_digest(type(obj))
+            return {"use": plugins.name_of(group, type(obj)), **({"source": source} if source else {})}
     return {}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
@@ -19,12 +20,14 @@ from cnpgen.robots.robot import load_robot
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.record import is_committed
+from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.verify.report import RowReport, merge
 from cnpgen.verify.rows import verify_rows
 
 PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
+PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32
+_ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 
 
 @dataclass(frozen=True)
@@ -117,16 +120,17 @@ def validate_dataset(
         plan = load_plan(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
+    wrong = {finding.file for finding in findings if not finding.note}
     present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
-    report, identical = None, 0
+    whole = [task for task in present if task.file not in wrong]
+    report, made, identical = None, 0, 0
     if deep:
-        report, found = _deep(folder, plan, present, worker_count(workers, len(present)), progress)
+        report, found = _deep(folder, plan, whole, worker_count(workers, len(whole)), progress)
         findings += found
     if regenerate:
-        identical, found = _regenerate(folder, plan, present, regenerate)
+        made, identical, found = _regenerate(folder, plan, whole, regenerate)
         findings += found
-    rows = sum(task.rows for task in present)
-    return ValidationReport(folder, rows, tuple(findings), report, regenerate if present else 0, identical)
+    return ValidationReport(folder, sum(task.rows for task in present), tuple(findings), report, made, identical)
 
 
 def _deep(
@@ -135,68 +139,95 @@ def _deep(
     """Recompute every row, shard by shard."""
     from joblib import Parallel, delayed
 
-    reports, findings = [], []
+    reports, findings, keys = [], [], [np.empty(0, np.uint64)]
     run = Parallel(n_jobs=workers, return_as="generator", batch_size=1)
     for task, result in zip(tasks, run(delayed(_verify_shard)(folder, plan, task) for task in tasks), strict=True):
-        if isinstance(result, str):
-            findings.append(Finding(task.file, result))
-            continue
-        reports.append(result)
-        findings += [
-            Finding(
-                task.file,
-                f"{check.name}: {check.rows_out} rows out, worst {check.worst:.3g} {check.unit}"
-                f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}",
-            )
-            for check in result.failed
-        ]
+        findings += [Finding(task.file, problem) for problem in result.problems]
+        if result.report is not None:
+            reports.append(result.report)
+        keys.append(result.keys)
         if progress is not None:
             progress(task.rows)
+    every = np.concatenate(keys)
+    twice = len(every) - len(np.unique(every))
+    if twice:
+        findings.append(Finding("(all splits)", f"{twice} rows stand in the dataset more than once"))
     return merge(reports) if reports else None, findings
 
 
-def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> RowReport | str:
+@dataclass(frozen=True)
+class _ShardCheck:
+    """What the deep check found in one shard.
+
+    Attributes:
+        report: What Pinocchio and Coal say, or None if the shard cannot be read.
+        problems: What is wrong with it.
+        keys: A hash of the boundary states of every row, shape (rows,).
+    """
+
+    report: RowReport | None
+    problems: list[str]
+    keys: NDArray[np.uint64]
+
+
+def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardCheck:
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
         columns = read_shard(folder / task.file)
+        tried = load_record(folder, task).outcome.tried
     except CnpgenError as error:
-        return str(error)
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64))
     with restored(plan) as recipe:
         problem = recipe.pipeline.problem
-        return verify_rows(problem, load_robot(problem), columns, dtype=plan.dtype)
+        report = verify_rows(problem, load_robot(problem), columns, dtype=plan.dtype)
+    problems = [
+        f"{check.name}: {check.rows_out} rows out, worst {check.worst:.3g} {check.unit}"
+        f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}"
+        for check in report.failed
+    ]
+    if not np.array_equal(columns["sample_id"], task.first_row + np.arange(task.rows)):
+        problems.append("sample_id does not count the rows of the split")
+    if int(columns["attempts"].sum()) != tried:
+        problems.append(f"attempts sum to {columns['attempts'].sum()}, but {tried} draws are recorded")
+    ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
+    bits = np.ascontiguousarray(np.concatenate(ends, axis=1), np.float64).view(np.uint64)
+    keys = (bits * np.resize(_ODD, bits.shape[1])).sum(axis=1, dtype=np.uint64)
+    return _ShardCheck(report, problems, keys)
 
 
-def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> tuple[int, list[Finding]]:
-    """Make random blocks again and compare them with what is stored."""
+def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> tuple[int, int, list[Finding]]:
+    """Make random blocks again; return how many, how many of them are the same to the bit, and what differs."""
+    if plan.block_rows != BLOCK_ROWS:
+        raise UsageError(f"the blocks of {folder} have {plan.block_rows} rows, those of this version {BLOCK_ROWS}")
+    pieces = [(task, block) for task in tasks for block in _blocks(task)]
     backend, cache_folder = choose_backend(plan.backend)
     dataset = open_dataset(folder, allow_partial=True)
-    random = np.random.default_rng()
+    chosen = np.random.default_rng().permutation(len(pieces))[:count]
     identical, findings = 0, []
     with restored(plan) as recipe:
         prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=plan.dtype)
-        for _ in range(count if tasks else 0):
-            task = tasks[random.integers(len(tasks))]
-            block = task.first_row // BLOCK_ROWS + int(random.integers(-(-task.rows // BLOCK_ROWS)))
-            start, stop = (
-                max(block * BLOCK_ROWS, task.first_row),
-                min((block + 1) * BLOCK_ROWS, task.first_row + task.rows),
-            )
+        for task, block in (pieces[index] for index in chosen):
+            start = max(block * BLOCK_ROWS, task.first_row)
+            stop = min((block + 1) * BLOCK_ROWS, task.first_row + task.rows)
             again, _ = shard_columns(prepared, plan, ShardTask(task.split, task.index, start, stop - start))
-            stored = dataset.read(task.split, start=start, stop=stop)
-            same, problem = _compare(stored, again)
+            same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
             identical += same
             if problem:
-                findings.append(
-                    Finding(task.file, f"block {block} made again from the seed: {problem}{_explanation(plan)}")
-                )
-    return identical, findings
+                text = f"block {block} made again from the seed: {problem}{_explanation(plan)}"
+                findings.append(Finding(task.file, text))
+    return len(chosen), identical, findings
+
+
+def _blocks(task: ShardTask) -> range:
+    """List the blocks that a shard has rows of."""
+    return range(task.first_row // BLOCK_ROWS, (task.first_row + task.rows - 1) // BLOCK_ROWS + 1)
 
 
 def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
     """Return whether all bits are the same, and what differs by more than arithmetic on another machine can explain."""
     same = all(np.array_equal(stored[name], values) for name, values in again.items())
     for name, values in again.items():
-        allowed = PORTABLE if values.dtype != np.float32 else 1e-5
+        allowed = {"f": PORTABLE, "i": 0}[values.dtype.kind] if values.dtype != np.float32 else PORTABLE_FLOAT32
         off = np.abs(stored[name].astype(float) - values.astype(float))
         if off.size and float(off.max()) > allowed:
             return same, f"{name} differs by {off.max():.3g}"

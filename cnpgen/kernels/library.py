@@ -68,7 +68,7 @@ class KernelLibrary:
         identity = {
             "builder": f"{builder.__module__}.{builder.__qualname__}",
             "source": [_package_digest(), _source_digest(builder)],
-            "casadi": importlib.metadata.version("casadi"),
+            "versions": [importlib.metadata.version(name) for name in ("casadi", "pin")],
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
             "parameters": parameters,

@@ -157,7 +157,7 @@ def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
     origins.append(data.oMf[model.getFrameId(robot.tip)].translation.copy())
     added = []
     for a, b in robot.skeleton:
-        joint = a + 1  # the segment from origin a on turns with joint a
+        joint = b  # the body that carries origin b; the joints between a and b lie on the segment's line
         first, second = data.oMi[joint].actInv(origins[a]), data.oMi[joint].actInv(origins[b])
         length = float(np.linalg.norm(second - first))
         turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (second - first) / length).toRotationMatrix()

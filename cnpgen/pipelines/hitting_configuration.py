@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
@@ -54,6 +55,8 @@ class HittingConfiguration(Stage):
         from cnpgen.pipelines import ik
 
         robot = context.robot
+        if robot.n < 3 or any(joint.prismatic for joint in robot.chain.joints):
+            raise RecipeError(["hitting-configuration needs three or more joints, all of them revolute"])
         first = context.kernels.load(ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS), vertical=False, max_step=0.4)
         newton = context.kernels.load(newton_step, Loop(TOLERANCE, MAX_STEPS))
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]

@@ -65,7 +65,10 @@ class TableVelocity(Stage):
 
     def describe(self) -> str:
         """Say how often at rest."""
-        return f"draw a start velocity on the table manifold within the limits, zero in {self.at_rest:.4g} of the cases"
+        return (
+            "draw a start velocity: direction uniform in the box of the limits, projected on the table manifold, length"
+            f" uniform between 0 and the first limit that it meets; zero in {100 * self.at_rest:.4g} % of the cases"
+        )
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The velocity."""
@@ -104,7 +107,8 @@ class TableAcceleration(Stage):
     def describe(self) -> str:
         """Say where."""
         return (
-            f"draw an acceleration of the {self.end} on the table manifold, within the acceleration and torque limits"
+            f"draw an acceleration of the {self.end} on the table manifold, uniform between the acceleration and torque"
+            " limits that it meets along a random direction"
         )
 
     def provides(self, context: Context) -> tuple[Field, ...]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,7 +71,7 @@ class PreparedPipeline:
         self.context = Context(problem, robot, kernels, dtype)
         self.fields = _ordered_fields(pipeline, self.context)
         written = _check_needs(pipeline, self.context)
-        self._stages: list[Run] = [stage.prepare(self.context) for stage in pipeline.stage]
+        self._stages = _prepare(pipeline, self.context)
         self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int = BLOCK_ROWS) -> Block:
@@ -101,7 +100,8 @@ class PreparedPipeline:
                 attempts = tally.count(batch, taken, first=skip, last=made == stop)
                 part = {field.name: batch[field.name][:, skip : len(taken)] for field in self.fields[:-2]}
                 parts.append({**part, "attempts": attempts[None]})
-            self._check_hope(batch, made, tried)
+            if made < stop:
+                self._check_hope(batch, made, tried)
         columns = {name: np.concatenate([part[name] for part in parts], axis=1) for name in parts[0]}
         columns["sample_id"] = index * BLOCK_ROWS + np.arange(first, stop, dtype=np.int64)[None]
         return Block(columns, tally.outcome())
@@ -128,8 +128,9 @@ class PreparedPipeline:
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:
-    """Return the random numbers of one block: SFC64 seeded by a SeedSequence of (seed; split, block)."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(split.encode()), index))
+    """Return the random numbers of one block: SFC64 seeded by a SeedSequence of (seed; sha256 of the split, block)."""
+    words = np.frombuffer(hashlib.sha256(split.encode()).digest(), "<u4").tolist()
+    sequence = np.random.SeedSequence(seed, spawn_key=(*words, index))
     return np.random.Generator(np.random.SFC64(sequence))
 
 
@@ -163,6 +164,19 @@ def _round_size(made: int, tried: int) -> int:
         return LARGEST_ROUND
     missing = (BLOCK_ROWS - made) * tried / made
     return int(np.clip(np.ceil(1.03 * missing) + 32, SMALLEST_ROUND, LARGEST_ROUND))
+
+
+def _prepare(pipeline: Pipeline, context: Context) -> list[Run]:
+    """Prepare every stage; raise all their mistakes at once, each with file and stage."""
+    runs, mistakes = [], []
+    for index, stage in enumerate(pipeline.stage):
+        try:
+            runs.append(stage.prepare(context))
+        except RecipeError as error:
+            mistakes += [f"{pipeline.path}: stage[{index}]: {mistake}" for mistake in error.mistakes]
+    if mistakes:
+        raise RecipeError(mistakes)
+    return runs
 
 
 def _ordered_fields(pipeline: Pipeline, context: Context) -> tuple[Field, ...]:

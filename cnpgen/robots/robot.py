@@ -136,8 +136,9 @@ def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         return bool(np.ptp(points[:, a], axis=0).max() < 1e-9)
 
     def straight(a: int, b: int, c: int) -> bool:
-        normal = np.cross(points[:, b] - points[:, a], points[:, c] - points[:, b])
-        return bool(np.abs(normal).max() < 1e-9)
+        first, second = points[:, b] - points[:, a], points[:, c] - points[:, b]
+        onwards = bool((first * second).sum(axis=1).min() > 0)  # a link that folds back is one of its own
+        return onwards and bool(np.abs(np.cross(first, second)).max() < 1e-9)
 
     kept = [0]
     for point in range(1, points.shape[1]):

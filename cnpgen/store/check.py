@@ -235,4 +235,6 @@ def _extras(folder: Path, plan: DatasetPlan) -> Iterator[Finding]:
         for item in sorted(parent.iterdir()) if parent.is_dir() else ():
             name = item.relative_to(folder).as_posix()
             if name not in known:
-                yield Finding(name, "is not part of the dataset", note=True)
+                loaded = parent != folder and item.suffix == ".h5"
+                text = "is not part of the dataset" + (", but loaders would read it" if loaded else "")
+                yield Finding(name, text, note=not loaded)

@@ -13,6 +13,7 @@ from cnpgen.store.documents import canonical_sha256, load_document, plain, save_
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
 FORMAT = "cnpgen-plan"
+REVISION = 1  # of the generator: raised by every change after which the same plan would give other rows
 FORMAT_VERSION = 1
 _INFORMATIONAL = ("title", "license", "versions")
 
@@ -62,6 +63,7 @@ class DatasetPlan:
         dtype: Float type of the stored numbers, "float64" or "float32".
         backend: Which kernels computed them: "compiled", "numpy", ...
         generator: How random numbers are made.
+        revision: Revision of the generator's code: rows of different ones must not mix.
         fields: The columns, in order.
         robot: Name, digest of the URDF, joint names and limits.
         versions: Versions of cnpgen, Python and libraries when the plan was made; not part of the plan's identity.
@@ -80,6 +82,7 @@ class DatasetPlan:
     dtype: str = "float64"
     backend: str
     generator: str = "numpy SFC64 seeded by SeedSequence"
+    revision: int = REVISION
     fields: tuple[Field, ...]
     robot: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)

@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.files import machine_error, sweep
 from cnpgen.store.layout import PLAN, WORK
 from cnpgen.store.plan import DatasetPlan, load_plan, save_plan, to_json
@@ -29,7 +29,7 @@ def open_workspace(folder: Path, plan: DatasetPlan) -> None:
                 f"{folder} holds another dataset ({_difference(found, plan)});"
                 " choose another --out, or replace it with --force"
             )
-    elif folder.is_dir() and any(path.name != WORK for path in folder.iterdir()):
+    elif folder.is_dir() and any(path.name not in (WORK, PLAN) for path in folder.iterdir()):
         raise UsageError(f"{folder} is not empty and not a dataset of cnpgen; choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,10 @@ def clear_dataset(folder: Path) -> None:
         return
     if not (folder / PLAN).is_file():
         raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
-    splits = [folder / split for split in load_plan(folder).splits]
+    try:
+        splits = [folder / split for split in load_plan(folder).splits]
+    except DatasetError:  # a damaged plan: what looks like a split is one
+        splits = sorted({path.parent for path in folder.glob("*/shard-*.json")})
     foreign = _foreign(folder, splits)
     if foreign:
         raise UsageError(
