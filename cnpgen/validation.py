@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import restore_dataset_recipe
-from cnpgen.make import shard_columns, versions, worker_count
+from cnpgen.make import worker_count
+from cnpgen.make_shard import shard_columns, versions
 from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
 from cnpgen.recipes import DatasetRecipe
 from cnpgen.robots.robot import load_robot

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ LAYERS = (
     ("pipelines",),
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "refine", "export", "plan_plots"),
-    ("make", "validation", "inspection", "describe", "plots", "doctor"),
+    ("make_shard", "make", "validation", "inspection", "describe", "plots", "doctor"),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.
@@ -117,3 +118,53 @@ def test_importing_recipes_or_listing_them_loads_nothing_heavy(statement: str) -
     code = f"{statement}\nimport sys\nprint('LOADED', *sorted(set({HEAVY!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "LOADED"
+
+
+def modules_of(imported: set[str]) -> set[str]:
+    """The package's own modules among imported names."""
+    known = {name(module) for module in MODULES}
+    return {target for target in (item.removeprefix("cnpgen.") for item in imported) if target in known}
+
+
+def test_no_module_imports_itself_in_a_circle_not_even_inside_functions() -> None:
+    graph = {name(module): modules_of(imports(module)) - {name(module)} for module in MODULES}
+    order = list(TopologicalSorter(graph).static_order())  # raises CycleError
+    assert set(order) == set(graph)
+
+
+def python(code: str) -> str:
+    root = str(PACKAGE.parent)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    return done.stdout.splitlines()[-1]
+
+
+@pytest.mark.parametrize("command", ["", "make-dataset", "validate", "inspect", "list", "show", "doctor"])
+def test_help_is_given_without_loading_anything_heavy(command: str) -> None:
+    code = f"""
+import sys
+from contextlib import suppress
+from cnpgen.cli.main import main
+with suppress(SystemExit):
+    main([*{command.split()!r}, "--help"])
+print("LOADED", *sorted(set({(*HEAVY, "numpy.testing")!r}) & set(sys.modules)))
+"""
+    assert python(code) == "LOADED"
+
+
+def test_the_verifier_runs_without_a_module_of_what_it_verifies() -> None:
+    """Not only by what the source says: rows are verified and then there is no kernel or stage in the process."""
+    code = """
+import sys
+import numpy as np
+from cnpgen.library import load_problem
+from cnpgen.robots.robot import load_robot
+from cnpgen.verify.rows import verify_rows
+problem = load_problem("heavy-object")
+robot = load_robot(problem)
+zero = np.zeros((1, robot.n))
+fields = {"start_q": zero, "start_dq": zero, "start_ddq": zero, "goal_q": zero, "goal_dq": zero}
+verify_rows(problem, robot, {**fields, "start_xyz": np.ones((1, 3)), "goal_xyz": np.ones((1, 3))})
+apart = ("cnpgen.kernels", "cnpgen.pipelines.", "cnpgen.robots.symbolic", "cnpgen.robots.boxes", "casadi")
+print("LOADED", *sorted(m for m in sys.modules if m.startswith(apart) and m != "cnpgen.pipelines.stage"))
+"""
+    assert python(code) == "LOADED"

@@ -17,17 +17,19 @@ import numpy as np
 import pytest
 from conftest import SHIPPED, TINY_SHARD, columns_of, tiny_recipe
 
-from cnpgen import make
+from cnpgen import make_shard as make
 from cnpgen.errors import MachineError, RecipeError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import load_dataset_recipe
-from cnpgen.make import Job, make_dataset, make_shard, plan_dataset, shard_columns, worker_count
+from cnpgen.make import make_dataset, plan_dataset, worker_count
+from cnpgen.make_shard import Job, make_shard, shard_columns
 from cnpgen.outcome import Outcome
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import load_manifest
 from cnpgen.store.plan import load_plan, shards
 from cnpgen.store.record import pending
+from cnpgen.store.workspace import open_workspace
 from cnpgen.validation import validate_dataset
 
 ROOT = Path(__file__).parents[1]
@@ -358,6 +360,14 @@ def test_all_parts_of_a_job_array_make_the_dataset_and_the_last_one_finishes_it(
     assert validate_dataset(folder).ok
 
 
+def test_force_would_delete_what_other_parts_made(tiny, tmp_path):
+    folder = Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "out"))
+    before = snapshot(folder)
+    with pytest.raises(UsageError, match="--force would delete what the other parts have made"):
+        make_tiny(folder, part=(0, 2), force=True)
+    assert snapshot(folder) == before
+
+
 def test_a_part_without_shards_makes_nothing(tmp_path):
     made = make_tiny(tmp_path / "out", part=(6, 7))
     assert (made.made, made.complete) == (0, False)
@@ -435,8 +445,8 @@ WRONG = {
     "dtype": ({"dtype": "float16"}, "dtype must be 'float64' or 'float32', got 'float16'"),
     "backend": ({"backend": "cuda"}, "backend 'cuda' does not exist"),
     "workers": ({"workers": 0}, "workers must be at least 1, got 0"),
-    "part beyond the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2"),
-    "part of nothing": ({"part": (0, 0)}, "part must be K/M"),
+    "part beyond the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2|--force would delete"),
+    "part of nothing": ({"part": (0, 0)}, "part must be K/M|--force would delete"),
 }
 
 
@@ -487,7 +497,7 @@ def test_the_worst_violation_of_every_check_is_recorded(tiny):
 def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job") / "out"
     job = plan_dataset(tiny_recipe("airhockey-hit"), folder, shard_size=TINY_SHARD)
-    make.open_workspace(job.folder, job.plan)
+    open_workspace(job.folder, job.plan)
     return job
 
 

@@ -1,10 +1,13 @@
 """What is installed: only cnpgen, with its recipes; complete public names; one version everywhere."""
 
+import ast
+import os
 import re
 import subprocess
 import sys
 import tomllib
 import zipfile
+from email.parser import Parser
 from pathlib import Path
 
 import pytest
@@ -36,6 +39,51 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
             if path.is_file():
                 assert f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" in wheel.namelist()
     assert "cnpgen/py.typed" in wheel.namelist()
+
+
+INSTALLED = """
+import cnpgen, sys
+from importlib.metadata import entry_points, version
+from cnpgen.library import recipes_root
+assert cnpgen.__file__.startswith(sys.argv[1]), cnpgen.__file__
+assert recipes_root().is_relative_to(sys.argv[1]), recipes_root()
+for name in cnpgen.__all__:
+    getattr(cnpgen, name)
+for name in cnpgen.list_recipes("dataset"):
+    recipe = cnpgen.load_dataset_recipe(name)
+    assert recipe.pipeline.problem.urdf_path.is_relative_to(sys.argv[1])
+(script,) = entry_points(group="console_scripts", name="cnpgen")
+assert callable(script.load())
+print(version("cnpgen"), len(cnpgen.list_recipes("dataset")))
+"""
+
+
+def test_what_the_wheel_installs_works_by_itself(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """Unpacked elsewhere, away from the repository: names, recipes, version, script."""
+    site, home = tmp_path / "site", tmp_path / "home"
+    wheel.extractall(site)
+    home.mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    command = [sys.executable, "-c", INSTALLED, str(site)]
+    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    shipped = len(list((ROOT / "datasets").glob("*.toml")))
+    assert done.stdout.split() == [cnpgen.__version__, str(shipped)]
+
+
+def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.ZipFile) -> None:
+    imported = set()
+    for path in (ROOT / "cnpgen").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                imported.add(node.module.split(".")[0])
+    (metadata,) = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
+    declared = Parser().parsestr(wheel.read(metadata).decode()).get_all("Requires-Dist") or []
+    libraries = {re.split(r"[^A-Za-z0-9_.-]", text)[0] for text in declared}
+    others = imported - set(sys.stdlib_module_names) - {"cnpgen"}
+    assert {{"pinocchio": "pin"}.get(name, name) for name in others} <= libraries
 
 
 def test_no_code_lives_beside_the_package() -> None:

@@ -97,7 +97,9 @@ def test_no_rows_is_a_usage_error(recipe, n):
 def test_resolved_is_plain_json_with_everything_referred_to(recipe):
     plain = resolved(recipe)
     assert json.loads(json.dumps(plain)) == plain
-    assert plain["pipeline"]["stage"] == [{"use": f"{__name__}:Roll", "size": [0.0, 1.0]}]
+    (stage,) = plain["pipeline"]["stage"]
+    assert len(stage.pop("source")) == 64  # the digest of a plug-in's code
+    assert stage == {"use": f"{__name__}:Roll", "size": [0.0, 1.0]}
     assert plain["pipeline"]["problem"]["limits"]["acceleration_cap"] == 20.0
     assert plain["version"] == "1.0.0"
     assert "path" not in plain

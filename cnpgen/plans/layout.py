@@ -12,6 +12,7 @@ REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
 FLOATS = (*REQUIRED, "goal_ddq", "duration")
 INTEGERS = ("sample_id", "status")
+ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
 _UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "xyz": "m"}
 _MEANINGS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}

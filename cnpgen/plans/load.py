@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.library import load_problem
-from cnpgen.plans.layout import BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, REQUIRED
+from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
@@ -36,14 +36,9 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
     path = Path(path)
     wanted = None if problem is None else record_problem(_loaded(problem))
     with opened_hdf5(path) as file:
-        attributes = dict(file.attrs)
+        attributes = {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
         _check_format(path, attributes)
-        columns = {name: _read(path, item) for name, item in file.items() if hasattr(item, "dtype")}
-        if "status" in columns:
-            columns["status"] = _statuses(path, columns["status"], dict(file["status"].attrs))
-    missing = [name + nearest(name, columns.keys() - set(REQUIRED)) for name in REQUIRED if name not in columns]
-    if missing:
-        raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
+        columns = _columns(path, file)
     record = _record(path, attributes, wanted)
     try:
         return _assembled(path, record, columns, attributes)
@@ -55,9 +50,24 @@ def _loaded(problem: str | Path | Problem) -> Problem:
     return problem if isinstance(problem, Problem) else load_problem(problem)
 
 
-def _read(path: Path, dataset: Any) -> NDArray[Any]:
+def _columns(path: Path, file: Any) -> dict[str, NDArray[Any]]:
+    """Read the datasets of a file."""
+    columns = {}
+    for name, item in file.items():
+        if item is None:  # what h5py makes of a link to something that cannot be read
+            raise DatasetError(f"{path} is damaged: its {name!r} cannot be read")
+        if hasattr(item, "dtype"):
+            columns[name] = _read(path, name, item)
+    missing = [name + nearest(name, columns.keys() - {*REQUIRED}) for name in REQUIRED if name not in columns]
+    if missing:
+        raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
+    if "status" in columns:
+        columns["status"] = _statuses(path, columns["status"], dict(file["status"].attrs))
+    return columns
+
+
+def _read(path: Path, name: str, dataset: Any) -> NDArray[Any]:
     """Read a dataset in the type that it must have."""
-    name = dataset.name.lstrip("/")
     what, kinds = ("integers", "iu") if name in INTEGERS else ("floats", "f") if name in FLOATS else ("numbers", "fiu")
     if dataset.dtype.kind not in kinds:
         raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
