@@ -107,13 +107,9 @@ def sample_plan(motion: Motion, rate: float) -> Sampled:
     return Sampled(t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
 
 
-def _one(plans: Plans, index: int) -> Motion:
-    return Motion(plans.path_control_points[[index]], plans.rate_control_points[[index]], plans.degree)
-
-
 def _refused(plans: Plans, rate: float) -> dict[int, str]:
     """Find the plans that cannot be sampled: index -> why."""
-    found = {}
+    found, motion = {}, plans.motion
     for index, (status, duration) in enumerate(zip(screen(plans), plans.duration, strict=True)):
         why = ""
         if status != PlanStatus.UNKNOWN:
@@ -122,7 +118,7 @@ def _refused(plans: Plans, rate: float) -> dict[int, str]:
             why = f"it lasts {duration:.3g} s, less than a nanosecond"
         elif duration * rate > MOST_SAMPLES:
             why = f"it lasts {duration:.3g} s: more than {MOST_SAMPLES} samples at {rate:g} Hz"
-        elif not np.isfinite(_one(plans, index).at(np.linspace(0, 1, 101)).jerk).all():
+        elif not np.isfinite(motion[[index]].at(np.linspace(0, 1, 101)).jerk).all():
             why = "its derivatives are too large to compute with"
         if why:
             found[index] = f"plan {index} (sample {plans.sample_id[index]}): {why}"
@@ -132,7 +128,7 @@ def _refused(plans: Plans, rate: float) -> dict[int, str]:
 def _sampled(plans: Plans, rate: float, refused: dict[int, str]) -> Iterator[tuple[int, Sampled]]:
     for index in range(len(plans)):
         if index not in refused:
-            yield index, sample_plan(_one(plans, index), rate)
+            yield index, sample_plan(plans.motion[[index]], rate)
 
 
 def _write_npz(out: Path, plans: Plans, rate: float, refused: dict[int, str]) -> tuple[Path, ...]:

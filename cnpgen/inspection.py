@@ -119,7 +119,8 @@ def _yield(outcome: Outcome) -> dict[str, Any]:
     tried, left, steps = max(outcome.tried, 1), outcome.tried, []
     for reason, count in outcome.rejections.items():
         left -= count
-        steps.append({"reason": reason, "draws": count, "share": count / tried, "left": left / tried})
+        stage = outcome.stages.get(reason, "")
+        steps.append({"stage": stage, "reason": reason, "draws": count, "share": count / tried, "left": left / tried})
     share = outcome.accepted / tried
     return {"tried": outcome.tried, "accepted": outcome.accepted, "acceptance": share, "rejections": steps}
 

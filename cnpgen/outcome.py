@@ -46,6 +46,7 @@ class Outcome:
         tried: Number of draws.
         accepted: Draws that passed every stage.
         rejections: Reason -> number of draws, in pipeline order.
+        stages: Reason -> stage of the pipeline that rejects under it.
         densities: Name -> map.
         verification: Constraint -> worst violation among the stored rows, in the constraint's unit.
     """
@@ -53,6 +54,7 @@ class Outcome:
     tried: int
     accepted: int
     rejections: Mapping[str, int] = field(default_factory=dict)
+    stages: Mapping[str, str] = field(default_factory=dict)
     densities: Mapping[str, DensityMap] = field(default_factory=dict)
     verification: Mapping[str, float] = field(default_factory=dict)
 
@@ -77,6 +79,7 @@ class Outcome:
             tried=self.tried + other.tried,
             accepted=self.accepted + other.accepted,
             rejections={name: self.rejections.get(name, 0) + other.rejections.get(name, 0) for name in reasons},
+            stages={**self.stages, **other.stages},
             densities=densities,
             verification=worst,
         )
@@ -89,6 +92,7 @@ class Outcome:
         """Return everything as a JSON-able dict."""
         return {
             **self.yield_json(),
+            "stages": dict(self.stages),
             "verification": dict(self.verification),
             "densities": densities_to_json(self.densities),
         }
@@ -128,6 +132,7 @@ def outcome_from_json(content: Mapping[str, Any]) -> Outcome:
         tried=int(content["tried"]),
         accepted=int(content["accepted"]),
         rejections={name: int(count) for name, count in content["rejections"].items()},
+        stages={name: str(stage) for name, stage in content["stages"].items()},
         densities=densities_from_json(content["densities"]),
         verification={name: float(value) for name, value in content["verification"].items()},
     )

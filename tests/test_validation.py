@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,9 +51,9 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
     with h5py.File(folder / file, "r+") as shard:
         change(shard)
     record, plan = load_record(folder, task), load_plan(folder)
-    statistics = record.statistics
-    with suppress(KeyError, ValueError):
-        statistics = column_statistics(read_shard(folder / file), plan.fields)
+    columns, statistics = read_shard(folder / file), record.statistics
+    if len(columns) == len(plan.fields) and all(np.isfinite(values).all() for values in columns.values()):
+        statistics = column_statistics(columns, plan.fields)
     size, digest = (folder / file).stat().st_size, file_sha256(folder / file)
     save_record(folder, task, replace(record, bytes=size, sha256=digest, statistics=statistics))
     finalize(folder)

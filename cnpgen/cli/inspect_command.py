@@ -77,15 +77,17 @@ def _yield_lines(outcome: "Outcome") -> list[str]:
     """Lay out the fates of the draws, in pipeline order."""
     from cnpgen.describe import table
 
-    rows = [("rejected because", "draws", "of all", "left"), ("", f"{outcome.tried:,}", "", "100.00 %")]
-    left = outcome.tried
+    rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{outcome.tried:,}", "", "100.00 %")]
+    left, before = outcome.tried, ""
     for reason, count in outcome.rejections.items():
+        stage = outcome.stages.get(reason, "")
+        accepts = 100 * (1 - count / left) if left else 100.0
         left -= count
-        rows.append(
-            (reason, f"{count:,}", f"{100 * count / outcome.tried:.2f} %", f"{100 * left / outcome.tried:.2f} %")
-        )
+        label = stage if stage != before else ""
+        rows.append((label, reason, f"{count:,}", f"{accepts:.2f} %", f"{100 * left / outcome.tried:.2f} %"))
+        before = stage
     share = f"{100 * outcome.accepted / outcome.tried:.2f} %"
-    lines = table([(*row, "") for row in rows], indent="  ", right=(1, 2, 3))
+    lines = table([(*row, "") for row in rows], indent="  ", right=(2, 3, 4))
     return [f"  {outcome.accepted:,} of {outcome.tried:,} draws accepted, {share}", *lines]
 
 

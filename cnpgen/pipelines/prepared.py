@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen import plugins
 from cnpgen.constraints.constraint import EXACTNESS
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.fields import Field
@@ -108,12 +109,14 @@ class PreparedPipeline:
 
     def _round(self, random: np.random.Generator, size: int) -> Batch:
         batch = Batch(size)
-        for run in self._stages:
+        for label, run in self._stages:
+            batch.stage = label
             run(batch, random)
         if self.context.dtype == "float32":
             for field in self.fields:
                 if field.name in batch.columns:
                     batch[field.name] = as_stored(batch[field.name], field)
+        batch.stage = "acceptance"
         self._accept(batch, random)
         return batch
 
@@ -166,12 +169,13 @@ def _round_size(made: int, tried: int) -> int:
     return int(np.clip(np.ceil(1.03 * missing) + 32, SMALLEST_ROUND, LARGEST_ROUND))
 
 
-def _prepare(pipeline: Pipeline, context: Context) -> list[Run]:
-    """Prepare every stage; raise all their mistakes at once, each with file and stage."""
+def _prepare(pipeline: Pipeline, context: Context) -> list[tuple[str, Run]]:
+    """Prepare and label every stage; raise all their mistakes at once, each with file and stage."""
     runs, mistakes = [], []
     for index, stage in enumerate(pipeline.stage):
         try:
-            runs.append(stage.prepare(context))
+            label = f"{index + 1}. {plugins.name_of(plugins.STAGES, type(stage))}"
+            runs.append((label, stage.prepare(context)))
         except RecipeError as error:
             mistakes += [f"{pipeline.path}: stage[{index}]: {mistake}" for mistake in error.mistakes]
     if mistakes:

@@ -25,6 +25,8 @@ class Batch:
         fate: For every draw of the round, 0 while alive, else 1 + the index of its reason, shape (N,).
         reasons: The reasons seen so far, in order of first use.
         columns: Name -> values of the surviving draws, shape (width, n), contiguous rows.
+        stage: Label of the stage that works on the batch now.
+        origins: Reason -> label of the stage that first gave it.
         drawn: Name -> values of all draws, shape (width, N), for columns written before any rejection.
     """
 
@@ -35,6 +37,8 @@ class Batch:
         self.reasons: list[str] = []
         self.columns: dict[str, Array] = {}
         self.drawn: dict[str, Array] = {}
+        self.stage = ""
+        self.origins: dict[str, str] = {}
 
     def __getitem__(self, name: str) -> Array:
         return self.columns[name]
@@ -55,6 +59,7 @@ class Batch:
         """End the draws where ``ok`` (shape (n,)) is false under ``reason`` and drop them from every column."""
         if reason not in self.reasons:
             self.reasons.append(reason)
+            self.origins[reason] = self.stage
         if ok.all():
             return
         self.fate[self.alive[~ok]] = 1 + self.reasons.index(reason)

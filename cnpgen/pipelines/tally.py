@@ -26,6 +26,7 @@ class Tally:
         self.accepted = 0
         self._waiting = 0  # draws since the last accepted one
         self._rejections: dict[str, int] = {}
+        self._stages: dict[str, str] = {}
         self._maps = [field for field in fields if field.name.endswith("_xyz")]
         self._drawn = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
         self._kept = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
@@ -50,6 +51,7 @@ class Tally:
         fates = np.bincount(batch.fate[start:stop], minlength=1 + len(batch.reasons))
         for reason, number in zip(batch.reasons, fates[1:].tolist(), strict=True):
             self._rejections[reason] = self._rejections.get(reason, 0) + number
+        self._stages.update(batch.origins)
         self.tried += stop - start
         self.accepted += len(wanted)
         for field in self._maps:
@@ -69,7 +71,13 @@ class Tally:
             shape = (CELLS, CELLS)
             (x, y), drawn, kept = _extent(field), self._drawn[field.name], self._kept[field.name]
             maps[field.name] = DensityMap(x, y, drawn.reshape(shape), kept.reshape(shape))
-        return Outcome(tried=self.tried, accepted=self.accepted, rejections=self._rejections, densities=maps)
+        return Outcome(
+            tried=self.tried,
+            accepted=self.accepted,
+            rejections=self._rejections,
+            stages=self._stages,
+            densities=maps,
+        )
 
 
 def _extent(field: Field) -> tuple[tuple[float, float], tuple[float, float]]:

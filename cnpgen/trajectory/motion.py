@@ -1,6 +1,7 @@
 """N motions of one robot: positions and their derivatives in time, duration, time as a function of phase."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.spline import basis, graded_edges, horner, lowest, pick, pieces
 
 Array = NDArray[np.float64]
+BLOCK = 16_384  # numbers
 _NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2  # on [0, 1]
 
 
@@ -48,6 +50,9 @@ class Motion:
     def __len__(self) -> int:
         return len(self.path)
 
+    def __getitem__(self, index: slice | list[int] | NDArray[Any]) -> "Motion":
+        return Motion(self.path[index], self.rate[index], self.degree)
+
     @property
     def spec(self) -> TrajectorySpec:
         """Degree and numbers of control points."""
@@ -63,6 +68,10 @@ class Motion:
         Args:
             s: Phases in [0, 1], shape (K,), the same for all motions, or (N, K).
         """
+        blocks = self._blocks(s.shape[1]) if s.ndim == 2 else []
+        if len(blocks) > 1:
+            parts = [vars(self[block].at(s[block])) for block in blocks]
+            return States(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
         with np.errstate(over="ignore", invalid="ignore"):  # garbage in, nan out
             if s.ndim == 1:
                 p = [basis(s, self.path.shape[1], self.degree, order) @ self.path for order in range(4)]
@@ -99,11 +108,14 @@ class Motion:
         edges = np.union1d(graded_edges(self.rate.shape[1], self.degree), s)
         width = np.diff(edges)
         points = edges[:-1, None] + width[:, None] * _NODES
-        with np.errstate(all="ignore"):  # garbage in, garbage out
-            rate = self.rate @ basis(points.ravel(), self.rate.shape[1], self.degree).T
-            cells = (1.0 / rate).reshape(len(self), *points.shape) @ _WEIGHTS * width
-            total = np.concatenate([np.zeros((len(self), 1)), np.cumsum(cells, axis=1)], axis=1)
-        return np.asarray(total[:, np.searchsorted(edges, s)])
+        table, found = basis(points.ravel(), self.rate.shape[1], self.degree).T, np.searchsorted(edges, s)
+        times = np.empty((len(self), len(s)))
+        for block in self._blocks(points.size):
+            with np.errstate(all="ignore"):  # garbage in, garbage out
+                inverse = 1.0 / (self.rate[block] @ table)
+                total = np.cumsum(inverse.reshape(-1, *points.shape) @ _WEIGHTS * width, axis=1)
+            times[block] = np.pad(total, [(0, 0), (1, 0)])[:, found]
+        return times
 
     def phase_at(self, t: Array) -> Array:
         """Phase at times t: the inverse of ``time_at``, by Newton's method within the cells of its quadrature.
@@ -114,6 +126,9 @@ class Motion:
         Returns:
             Shape (N, K), exactly 0 and 1 at the ends; without meaning where r is not positive.
         """
+        blocks = self._blocks(t.shape[1])
+        if len(blocks) > 1:
+            return np.concatenate([self[block].phase_at(t[block]) for block in blocks])
         edges = graded_edges(self.rate.shape[1], self.degree)
         known = self.time_at(edges)
         with np.errstate(all="ignore"):
@@ -139,6 +154,11 @@ class Motion:
         Exact for motions from rest to rest: their boundary velocities and accelerations stay zero.
         """
         return Motion(self.path, self.rate / factor[:, None], self.degree)
+
+    def _blocks(self, columns: int) -> list[slice]:
+        """Split the motions so that arrays of shape (block, columns) stay in the cache."""
+        size = max(BLOCK // max(columns, 1), 1)
+        return [slice(first, first + size) for first in range(0, len(self), size)]
 
 
 def _states(p: list[Array], r: list[Array]) -> States:
