@@ -108,11 +108,13 @@ def measure_stages(case: Case, blocks: int) -> None:
     """Time every stage of some blocks."""
     prepared = case.prepared
     case.stages = [StageTime(name) for name in [*map(_label, prepared.pipeline.stage), "(last gate)"]]
-    runs: list[Run] = [*prepared._stages, prepared._accept]
-    *prepared._stages, prepared._accept = [stage.timed(run) for stage, run in zip(case.stages, runs, strict=True)]
+    stages, accept = prepared._stages, prepared._accept
+    timed = [stage.timed(run) for stage, run in zip(case.stages, [*(run for _, run in stages), accept], strict=True)]
+    prepared._stages = [(label, run) for (label, _), run in zip(stages, timed, strict=False)]
+    prepared._accept = timed[-1]
     case.total, case.drawn = case.make(blocks)
     case.rows = blocks * BLOCK_ROWS
-    *prepared._stages, prepared._accept = runs
+    prepared._stages, prepared._accept = stages, accept
 
 
 def _label(stage: Stage) -> str:

@@ -317,6 +317,13 @@ def test_a_changed_problem_is_said(tmp_path: Path) -> None:
         load_plans(tmp_path / "plan.h5")
 
 
+def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
+    with h5py.File(write_minimal(tmp_path / "theirs.h5"), "a") as file:
+        file["start_xyz"] = h5py.SoftLink("/nowhere")
+    with pytest.raises(DatasetError, match=r"theirs\.h5 is damaged: its 'start_xyz' cannot be read"):
+        load_plans(tmp_path / "theirs.h5")
+
+
 def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
     for name, content, message in (
         ("none.h5", None, "is missing"),

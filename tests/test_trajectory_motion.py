@@ -165,6 +165,22 @@ def test_garbage_neither_warns_nor_disturbs_the_other_motions() -> None:
     assert motion.runs_forward().tolist() == [True] * 5 + [False] * 2 + [True]
 
 
+def test_a_motion_has_the_same_bits_alone_and_in_any_batch() -> None:
+    motion = draw_motion(10, n=70, joints=6)
+    s = np.linspace(0, 1, 333)
+    times = s * motion.duration()[:, None]
+    phases = motion.phase_at(times)
+    whole, own = motion.at(s), motion.at(phases)
+    for index in ([3], [69, 3], list(range(0, 70, 3))):
+        part = motion[index]
+        assert np.array_equal(part.duration(), motion.duration()[index])
+        assert np.array_equal(part.time_at(s), motion.time_at(s)[index])
+        assert np.array_equal(part.phase_at(times[index]), phases[index])
+        for name in FIELDS:
+            assert np.array_equal(getattr(part.at(s), name), getattr(whole, name)[index])
+            assert np.array_equal(getattr(part.at(phases[index]), name), getattr(own, name)[index])
+
+
 def test_the_spec_says_degree_and_sizes() -> None:
     assert draw_motion(9, degree=5).spec == TrajectorySpec(degree=5, path_control_points=15, rate_control_points=20)
     assert len(draw_motion(9)) == 4

@@ -74,11 +74,11 @@ class Motion:
             return States(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
         with np.errstate(over="ignore", invalid="ignore"):  # garbage in, nan out
             if s.ndim == 1:
-                p = [basis(s, self.path.shape[1], self.degree, order) @ self.path for order in range(4)]
-                r = [self.rate @ basis(s, self.rate.shape[1], self.degree, order).T for order in range(3)]
+                p = [basis(s, self.path.shape[1], self.degree, i) @ self.path for i in range(4)]
+                r = [(basis(s, self.rate.shape[1], self.degree, i) @ self.rate[..., None])[..., 0] for i in range(3)]
             else:
                 path, rate = (pick(pieces(control, self.degree), s) for control in (self.path, self.rate))
-                p, r = [horner(*path, order) for order in range(4)], [horner(*rate, order) for order in range(3)]
+                p, r = [horner(*path, i) for i in range(4)], [horner(*rate, i) for i in range(3)]
             return _states(p, r)
 
     def runs_forward(self) -> NDArray[np.bool_]:
@@ -112,7 +112,7 @@ class Motion:
         times = np.empty((len(self), len(s)))
         for block in self._blocks(points.size):
             with np.errstate(all="ignore"):  # garbage in, garbage out
-                inverse = 1.0 / (self.rate[block] @ table)
+                inverse = 1.0 / (self.rate[block, None] @ table)  # one product per motion: the same bits in any batch
                 total = np.cumsum(inverse.reshape(-1, *points.shape) @ _WEIGHTS * width, axis=1)
             times[block] = np.pad(total, [(0, 0), (1, 0)])[:, found]
         return times
@@ -140,11 +140,12 @@ class Motion:
             offset = offset - width / 2
             left = t - np.take_along_axis(known, cell, axis=1)
             ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
+            done = np.zeros(t.shape, bool)
             for _ in range(30):  # three or four, unless r is not positive
                 nodes = (weight / horner(rate, offset + ahead * x) for x, weight in zip(_NODES, _WEIGHTS, strict=True))
-                before = ahead
-                ahead = np.clip(ahead + (left - ahead * sum(nodes)) * horner(rate, offset + ahead), 0.0, width)
-                if np.nanmax(np.abs(ahead - before), initial=0.0) < 1e-15:
+                new = np.clip(ahead + (left - ahead * sum(nodes)) * horner(rate, offset + ahead), 0.0, width)
+                ahead, done = np.where(done, ahead, new), done | ~(np.abs(new - ahead) > 1e-15)
+                if done.all():
                     break
         return np.where(t >= known[:, -1:], 1.0, low + ahead)
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from math import factorial, perm
+from math import factorial, perm, prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +47,12 @@ def pieces(control: Array, degree: int) -> Array:
     """
     points = control.shape[1]
     left = np.arange(points - degree) / (points - degree)
+    columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
     taylor = [
-        np.tensordot(basis(left, points, degree, order), control, (1, 1)) / factorial(order)
+        np.moveaxis(basis(left, points, degree, order) @ columns, 0, 1) / factorial(order)  # motion by motion
         for order in range(degree, -1, -1)
     ]
-    return np.stack(taylor)
+    return np.stack(taylor).reshape(degree + 1, len(left), len(control), *control.shape[2:])
 
 
 def pick(coefficients: Array, s: Array) -> tuple[Array, Array]:
