@@ -102,3 +102,9 @@ def install(folder: Path, project: dict[str, object]) -> None:
     entry_points.read_dict(project["entry-points"])  # type: ignore[arg-type]
     with (info / "entry_points.txt").open("w", encoding="utf-8") as file:
         entry_points.write(file)
+
+
+def test_no_page_has_a_placeholder_left() -> None:
+    for page in PAGES:
+        for line in page.read_text(encoding="utf-8").splitlines():
+            assert not re.fullmatch(r"[A-Z]{4,}", line), f"{page.name}: {line}"

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from conftest import SHIPPED, Prepare, needs_compiler, run_stages
 
-from cnpgen.pipelines.acceptance import acceptance
+from cnpgen.pipelines.acceptance import _unmet, acceptance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
 
@@ -111,6 +112,15 @@ def test_a_number_that_is_none_is_never_accepted_wherever_it_is(prepare: Prepare
     accepted = [places[draw] for draw in again.alive.tolist() if draw < len(places)]
     assert accepted == []
     assert len(again.alive) == again.size - len(places)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (-1.0, np.inf), (-1.0, 1.0)])
+def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
+    x = ca.SX.sym("x")
+    unmet = ca.Function("unmet", [x], [_unmet([x], np.array([lower]), np.array([upper]), np.array([0.5]))])
+    assert [float(unmet(value)) for value in (0.0, 1.4, -1.4)] == [0.0, 0.0, 0.0]
+    assert float(unmet(np.nan)) > 0
+    assert [float(unmet(value)) > 0 for value in (1.6, -1.6)] == [bool(upper < 1.6), bool(lower > -1.6)]
 
 
 def test_torques_beyond_their_limits_are_rejected(prepare: Prepare, rounds):

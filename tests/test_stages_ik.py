@@ -16,11 +16,13 @@ EXACT = 1e-9  # m and rad
 ENDS = [("airhockey-hit", "start"), ("airhockey-replan", "start"), ("heavy-object", "start"), ("heavy-object", "goal")]
 
 
-@pytest.fixture(params=ENDS, ids=" ".join)
+@pytest.fixture(scope="module", params=ENDS, ids=" ".join)
 def solved(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, str, Batch]:
+    """Enough draws for some that end with joints on their limits, where convergence is slow."""
     name, end = request.param
     until = {"start": "StartIK", "goal": "GoalIK"}[end]
-    return prepare(name), end, run_stages(prepare(name), 6000, seed=31, until=until)
+    draws = 40_000 if name == "heavy-object" else 4000
+    return prepare(name), end, run_stages(prepare(name), draws, seed=31, until=until)
 
 
 def test_the_tip_is_at_its_position_within_a_nanometre(solved):
@@ -47,7 +49,7 @@ def test_almost_every_draw_has_a_solution(solved):
 @pytest.mark.parametrize("end", ["start", "goal"])
 def test_the_held_object_stands_upright(prepare, end):
     prepared = prepare("heavy-object")
-    batch = run_stages(prepared, 6000, seed=32, until="GoalIK")
+    batch = run_stages(prepared, 20_000, seed=32, until="GoalIK")
     arm = Arm(prepared.context.robot)
     up = np.array([arm.pose(q).rotation[:, 2].copy() for q in batch[f"{end}_q"].T])
     assert np.abs(up[:, :2]).max() < EXACT
