@@ -22,6 +22,11 @@ from cnpgen.store.record import pending
 from cnpgen.store.workspace import clear_dataset, open_workspace
 
 MAX_ROWS = 10**12
+ALONE = {
+    "compiled": 200_000,
+    "numpy": 20_000,
+    "casadi": 5_000,
+}  # rows up to which a second process is not worth its start
 
 Progress = Callable[[int, Outcome], None]  # called with the rows and the outcome of every shard that is finished
 Begin = Callable[[Path, int, int], None]  # called once with the folder, the rows wanted and those already there
@@ -69,7 +74,8 @@ def make_dataset(
         out: Folder of the dataset; default ``NAME-vMAJOR`` in the current folder.
         n: Rows over all splits; default the recipe's. Fewer rows are the first of each split.
         seed: Root seed; default the recipe's.
-        workers: Processes; default one per available core.
+        workers: Processes; default one per available core, or one where so few rows are missing that a second would
+            not pay.
         shard_size: Rows per shard; default between 8192 and 65536.
         dtype: "float64" or "float32", what rows are stored as and validated as.
         backend: "compiled", "numpy" or "casadi"; default the fastest that works.
@@ -101,6 +107,8 @@ def make_dataset(
     if begin is not None:
         rows = sum(task.rows for task in mine)
         begin(job.folder, rows, rows - sum(task.rows for task in tasks))
+    if workers is None and sum(task.rows for task in tasks) <= ALONE[job.backend]:
+        workers = 1
     made = 0
     with closing(_run(job, tasks, worker_count(workers, len(tasks)))) as results:
         for rows, outcome in results:

@@ -20,7 +20,6 @@ from cnpgen.fields import Field
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.robots.chain import Chain
 from cnpgen.robots.linalg import Scalar, add, cross, dot, factorize, inverse3, scale, substitute, subtract
 from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
 from cnpgen.schema import field
@@ -59,21 +58,45 @@ class HittingConfiguration(Stage):
             raise RecipeError(["hitting-configuration needs three or more joints, all of them revolute"])
         first = context.kernels.load(ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS), vertical=False, max_step=0.4)
         newton = context.kernels.load(newton_step, Loop(TOLERANCE, MAX_STEPS))
+        value = context.kernels.load(objective)
+        basic = basic_joints(robot)
+        free = [j for j in range(robot.n) if j not in basic]
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+
+        def climb(start: Array, batch: Batch, direction: Array, home: Array) -> tuple[Array, Array, Array]:
+            q, step = newton(start, batch["goal_xyz"], direction, home)
+            (f,) = value(q, direction, home)
+            solved = step[0] < TOLERANCE
+            return q, np.where(solved & ((low <= q) & (q <= high)).all(0), f[0], -np.inf), solved
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             home = (
                 batch["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], len(batch.alive), axis=1)
             )
-            guess, error = first(home, batch["goal_xyz"])
             direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
-            q, step = newton(guess, batch["goal_xyz"], direction, home)
-            batch["goal_q"] = q
-            batch.reject((error[0] < ik.TOLERANCE) & (step[0] < TOLERANCE), "no hitting configuration")
+            guess, _ = first(home, batch["goal_xyz"])
+            q, best, solved = climb(guess, batch, direction, home)
+            mirrored = q.copy()  # a second optimum, where there is one, has the elbow on the other side of home
+            mirrored[free] = 2 * home[free] - q[free]
+            mirrored, _ = first(mirrored, batch["goal_xyz"])
+            other, second, solved_too = climb(mirrored, batch, direction, home)
+            batch["goal_q"] = np.where(second > best, other, q)
+            batch.reject(np.where(second > best, solved_too, solved), "no hitting configuration")
             q = batch["goal_q"]
             batch.reject(((low <= q) & (q <= high)).all(0), "joint position limit at the goal")
 
         return run
+
+
+def objective(robot: "Robot") -> Any:
+    """Build ``(q, d, q0) -> f``: the squared manipulability along d less the penalty on the distance from q0."""
+    import casadi as ca
+
+    (q_sx, q), (d_sx, d), (home_sx, home) = symbols("q", robot.n), symbols("d", 2), symbols("q0", robot.n)
+    jacobian = forward_kinematics(robot.chain, q).jacobian
+    gain = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
+    away = [(b - a) / float(rated) for a, b, rated in zip(q, home, robot.rated_velocity, strict=True)]
+    return ca.Function("objective", [q_sx, d_sx, home_sx], [dot(gain, gain) - dot(away, away)])
 
 
 def newton_step(robot: "Robot") -> Any:
@@ -112,23 +135,27 @@ def newton_step(robot: "Robot") -> Any:
 
 
 def basic_joints(robot: "Robot") -> tuple[int, int, int]:
-    """Choose the joints through which the tip position is eliminated: largest least |det J_B| near the base."""
+    """Choose the joints through which the tip position is eliminated.
+
+    The three whose Jacobian is typically the best part of the arm's: the largest median over configurations near the
+    base of ``|det J_B| / sqrt(det J J^T)``. (The largest least value would be decided by a few odd configurations.)
+    """
+    import pinocchio as pin
+
     random = np.random.default_rng(0)
     low, high = np.maximum(robot.base - 0.7, robot.position_lower), np.minimum(robot.base + 0.7, robot.position_upper)
-    jacobians = [_numeric_jacobian(robot.chain, random.uniform(low, high)) for _ in range(64)]
+    data, tip = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    jacobians = np.array(
+        [pin.computeFrameJacobian(robot.model, data, random.uniform(low, high), tip, frame)[:3] for _ in range(64)]
+    )
+    volume = np.sqrt(np.linalg.det(jacobians @ jacobians.transpose(0, 2, 1)))
 
-    def worst(joints: tuple[int, ...]) -> float:
-        return min(abs(float(np.linalg.det(jacobian[:, joints]))) for jacobian in jacobians)
+    def share(joints: tuple[int, ...]) -> float:
+        return float(np.median(np.abs(np.linalg.det(jacobians[:, :, list(joints)])) / volume))
 
-    best = max(combinations(range(robot.n), 3), key=worst)
+    best = max(combinations(range(robot.n), 3), key=share)
     return best[0], best[1], best[2]
-
-
-def _numeric_jacobian(chain: Chain, q: Array) -> Array:
-    import casadi as ca
-
-    kin = forward_kinematics(chain, [ca.SX(float(x)) for x in q])
-    return np.array([[float(ca.DM(ca.SX(x))) for x in column] for column in kin.jacobian]).T
 
 
 def _second_derivatives(kin: Kinematics) -> list[list[Vec]]:
