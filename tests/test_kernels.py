@@ -640,6 +640,24 @@ def test_a_tape_that_cannot_be_cached_is_used_nevertheless(tmp_path):
     np.testing.assert_array_equal(result, 2.0)
 
 
+def test_a_full_disk_leaves_no_half_of_a_tape(tmp_path, monkeypatch):
+    def full(*_arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    (result,) = library_in(tmp_path, "numpy").load(doubling)(np.ones((1, 3)))
+    np.testing.assert_array_equal(result, 2.0)
+    assert list((tmp_path / "tape").iterdir()) == []
+
+
+def test_a_cached_tape_may_be_read_by_whom_the_umask_allows(tmp_path):
+    """A cache that a group shares: temporary files, which only their owner may read, are not what is kept."""
+    library_in(tmp_path, "numpy").load(doubling)
+    (path,) = (tmp_path / "tape").iterdir()
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_backends_that_do_not_exist_are_named(own_cache):
     with pytest.raises(UsageError, match="'cuda' does not exist: expected one of compiled, numpy, casadi"):
         choose_backend("cuda")

@@ -87,9 +87,10 @@ def _store(path: Path, data: bytes) -> None:
     """Write a cache entry atomically; a cache that cannot be written only costs time."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(data)
-        Path(file.name).replace(path)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
+            built = Path(folder) / path.name
+            built.write_bytes(data)
+            built.replace(path)
     except OSError:
         return
 
