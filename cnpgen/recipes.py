@@ -101,6 +101,15 @@ class TrajectorySpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Objective:
+    """What a good motion is: the integral over time of ``1 + centrifugal |kappa| v^2`` (paper, Appendix B, eta)."""
+
+    centrifugal: float = field(
+        "weight of the centrifugal acceleration |kappa| v^2 of the tip beside the time", unit="s^2/m", default=0.0, low=0.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """What a valid motion is.
 
@@ -117,6 +126,7 @@ class Problem:
     obstacle: tuple[Obstacle, ...] = field("the boxes of the world", default=())
     constraint: tuple[Constraint, ...] = field("the constraint manifold", default=())
     trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
+    objective: Objective = field("what a good motion is", default=Objective())
     path: Path = Path()
     digest: str = ""
 

@@ -91,6 +91,7 @@ class Constraint(ABC):
 
     tolerance: float
     budget: float = field("acceptable violation while training (the paper's C-bar^2)", low=0.0, default=0.0)
+    weight: float = field("first weight while training (the paper's e^alpha)", low=1e-12, default=1.0)
 
     def allowed(self, condition: Condition) -> NDArray[np.float64]:
         """Return how far a motion may be outside a condition and still be called valid, in its unit, shape (m,)."""

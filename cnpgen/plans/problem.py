@@ -19,7 +19,7 @@ from cnpgen.store.documents import canonical_sha256, plain
 
 Array = NDArray[np.float64]
 
-_JUDGED_BY = ("tolerance", "budget")  # of constraints: how strictly a plan is judged, not what it is a plan for
+_JUDGED_BY = ("tolerance", "budget", "weight")  # of constraints: how strictly a plan is judged, not what it is a plan for
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ProblemRecord:
         """The sha256 over what plans of this problem mean.
 
         Left out is what may differ between files that can be compared: name and title, the base configuration, the
-        suggested parameterisation, and by how much constraints may be violated.
+        suggested parameterisation, the objective, and by how much constraints may be violated.
         """
         return canonical_sha256(_meaning(self))
 
@@ -117,7 +117,7 @@ def record_problem(problem: Problem) -> ProblemRecord:
 
 def _meaning(record: ProblemRecord) -> dict[str, Any]:
     """Reduce a problem to what its plans mean."""
-    kept = {key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory"}}
+    kept = {key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}}
     robot = {key: value for key, value in kept["robot"].items() if key not in {"urdf", "base"}}
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
     constraints = {
