@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from conftest import Prepare
 
-from cnpgen.pipelines.hitting_configuration import HittingConfiguration, objective
+from cnpgen.pipelines.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.hitting_newton import objective
 from cnpgen.pipelines.stage import Batch
 
 CASES = json.loads((Path(__file__).parent / "data" / "hitting_configurations.json").read_text())

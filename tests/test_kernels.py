@@ -284,7 +284,7 @@ def test_a_loop_s_lanes_do_not_depend_on_their_neighbours(root, cache_folder, ba
 @pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
 @pytest.mark.parametrize("kind", ["inverse kinematics", "hitting configuration"])
 def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, backend, kind):
-    from cnpgen.pipelines import hitting_configuration, ik
+    from cnpgen.pipelines import hitting_newton, ik
 
     kernels, robot = prepare("airhockey-replan", backend).context.kernels, prepare("airhockey-replan").context.robot
     random = np.random.default_rng(7)
@@ -295,8 +295,8 @@ def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, back
         kernel = kernels.load(ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS), vertical=False, max_step=0.4)
         arguments = [q, p]
     else:
-        loop = Loop(hitting_configuration.TOLERANCE, hitting_configuration.MAX_STEPS)
-        kernel = kernels.load(hitting_configuration.newton_step, loop)
+        loop = Loop(hitting_newton.TOLERANCE, hitting_newton.MAX_STEPS)
+        kernel = kernels.load(hitting_newton.newton_step, loop)
         arguments = [q, p, np.stack([np.cos(angle), np.sin(angle)]), np.repeat(robot.base[:, None], 203, axis=1)]
     whole = kernel(*arguments)
     for order in (random.permutation(203), np.arange(202, -1, -1), random.permutation(203)[:77]):

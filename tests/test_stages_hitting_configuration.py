@@ -1,7 +1,7 @@
 """The hitting configuration against SciPy's SLSQP, with objective, constraint and gradients by Pinocchio."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ from conftest import Arm, Prepare, run_stages
 from scipy.optimize import minimize
 
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.hitting_configuration import basic_joints, newton_step
+from cnpgen.pipelines.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.hitting_newton import basic_joints, newton_step
 from cnpgen.pipelines.ik import MAX_STEPS, TOLERANCE, ik_step
 from cnpgen.robots.robot import Robot
 
@@ -164,3 +165,67 @@ def test_a_step_is_never_longer_than_allowed(prepare):
     moved = np.linalg.norm(following - batch["start_q"], axis=0)
     assert moved.max() <= 0.6 + 1e-12
     np.testing.assert_allclose(moved, np.minimum(length[0], 0.6), rtol=1e-9)
+
+
+def sides(robot: Robot, q: Array) -> Array:
+    """-1 for joints on their lower limits, 1 on their upper ones, -2 and 2 beyond, else 0."""
+    low, high = robot.position_lower, robot.position_upper
+    return 1.0 * (q >= high) + (q > high) - 1.0 * (q <= low) - (q < low)
+
+
+def test_no_draw_is_lost_at_a_joint_limit(prepare):
+    """Near the inner edge of the reach the optimum of 0.013 % of the draws is beyond the limit of joint 6."""
+    prepared = prepare("airhockey-replan")
+    robot, limited = prepared.context.robot, 0
+    for seed in range(3):
+        batch = run_stages(prepared, 20_000, seed=seed, until="HittingConfiguration")
+        assert np.count_nonzero(batch.fate == 1 + batch.reasons.index("joint position limit at the goal")) == 0
+        limited += np.count_nonzero((sides(robot, batch["goal_q"].T) != 0).any(axis=1))
+    assert limited >= 3
+
+
+@pytest.fixture(scope="module")
+def cramped(prepare: Prepare) -> list[tuple[Search, Array]]:
+    """Searches of an arm that may move each joint 0.6 rad only, and our optima that are on a limit."""
+    context = prepare("airhockey-replan").context
+    base, low, high = context.robot.base, context.robot.position_lower, context.robot.position_upper
+    robot = replace(
+        context.robot, position_lower=np.maximum(low, base - 0.6), position_upper=np.minimum(high, base + 0.6)
+    )
+    kernels = replace(context.kernels, identity="cramped", arguments={**context.kernels.arguments, "robot": robot})
+    batch = run_stages(prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone")
+    batch.reject((np.abs(sides(robot, batch["start_q"].T)) < 2).all(axis=1), "elsewhere")
+    HittingConfiguration(near="start").prepare(replace(context, robot=robot, kernels=kernels))(batch, None)
+    angle, q, arm = batch["hit_angle"][0], batch["goal_q"], Arm(robot)
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    on_limit = (sides(robot, q.T) != 0).any(axis=1)
+    return [
+        (Search(robot, arm, batch["goal_xyz"][:, k], direction[:, k], batch["start_q"][:, k]), q[:, k])
+        for k in np.flatnonzero(on_limit)
+    ]
+
+
+def test_optima_on_limits_are_those_of_slsqp(cramped):
+    assert len(cramped) > 40
+    same = 0
+    for search, ours in cramped[:40]:
+        for start in [ours, *other_starts(search)]:
+            theirs = search.slsqp(start)
+            if theirs is not None:
+                assert search.value(ours) >= search.value(theirs) - 1e-6, (ours, theirs, search)
+                same += bool(np.abs(ours - theirs).max() < 1e-4)
+    assert same > 60
+
+
+def test_joints_on_their_limits_would_move_outwards_and_the_others_nowhere(cramped):
+    held = []
+    for search, ours in cramped:
+        jacobian, gradient = search.arm.jacobian(ours)[:3], search.gradient(ours)
+        side = sides(search.robot, ours)
+        multiplier = np.linalg.lstsq(jacobian[:, side == 0].T, gradient[side == 0], rcond=None)[0]
+        pull = gradient - jacobian.T @ multiplier
+        assert np.abs(pull[side == 0]).max() < 1e-7
+        assert (side * pull)[side != 0].min() > 0
+        assert np.linalg.norm(search.miss(ours)) < 1e-9
+        held.append(np.count_nonzero(side))
+    assert {1, 2, 3} <= set(held)

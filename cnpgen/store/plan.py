@@ -13,7 +13,7 @@ from cnpgen.store.documents import canonical_sha256, load_document, plain, save_
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
 FORMAT = "cnpgen-plan"
-REVISION = 1  # of the generator: raised by every change after which the same plan would give other rows
+REVISION = 2  # of the generator: raised by every change after which the same plan would give other rows
 FORMAT_VERSION = 1
 _INFORMATIONAL = ("title", "license", "versions")
 

@@ -1,0 +1,218 @@
+"""Newton's method for the hitting configuration: one step as an SX function.
+
+Maximise ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d``
+is the unit hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the
+configuration that the search stays close to, ``L`` the rated joint velocities. The optimality conditions are solved
+in closed form: ``d^2 p / dq_j dq_k = z_min(j,k) x J_max(j,k)``, hence gradient ``2 A a`` with ``a = J^T d`` and
+``A_jk = d . (z_min x J_max)``, and Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)`` with ``dz``, ``dJ``
+the derivatives along ``a``. The constraint is eliminated through three basic joints, so that each step factorizes
+only a (n - 3) x (n - 3) matrix.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.robots.linalg import Scalar, add, cross, dot, factorize, inverse3, scale, substitute, subtract
+from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+MAX_STEP = 0.6  # rad, Euclidean norm of one Newton step
+MIN_PIVOT = 1e-3  # smallest |pivot| of the reduced Hessian: keeps every step an ascent direction
+TOLERANCE = 1e-6  # rad, length of the last step taken; the next one would be its square
+MAX_STEPS = 40
+
+
+def objective(robot: "Robot") -> Any:
+    """Build ``(q, d, q0) -> f``: the squared manipulability along d less the penalty on the distance from q0."""
+    import casadi as ca
+
+    (q_sx, q), (d_sx, d), (home_sx, home) = symbols("q", robot.n), symbols("d", 2), symbols("q0", robot.n)
+    jacobian = forward_kinematics(robot.chain, q).jacobian
+    gain = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
+    away = [(b - a) / float(rated) for a, b, rated in zip(q, home, robot.rated_velocity, strict=True)]
+    return ca.Function("objective", [q_sx, d_sx, home_sx], [dot(gain, gain) - dot(away, away)])
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """Objective and constraint near a configuration.
+
+    Attributes:
+        kin: Positions and Jacobian there.
+        gradient: Of f, n.
+        direction: d, 3.
+        gain: ``J^T d``, n.
+        second: ``d^2 p / dq_j dq_k``, symmetric, n x n lists of 3.
+        slope: ``A_jk = d . d^2 p / dq_j dq_k``, symmetric, n x n.
+        weight: ``1 / L^2``, n.
+    """
+
+    kin: Kinematics
+    gradient: Vec
+    direction: Vec
+    gain: Vec
+    second: list[list[Vec]]
+    slope: list[Vec]
+    weight: list[float]
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.gain)
+
+    def hessian(self, multiplier: Vec) -> list[list[Scalar]]:
+        """Hessian of ``f - multiplier . FK``, full symmetric n x n."""
+        kin, slope = self.kin, self.slope
+        axis_rates, column_rates = _rates(kin, self.gain)
+        across = [cross(self.direction, axis) for axis in kin.axes]
+        across_rate = [cross(self.direction, rate) for rate in axis_rates]
+        hessian: list[list[Scalar]] = [[0.0] * self.n for _ in range(self.n)]
+        for j in range(self.n):
+            for k in range(j, self.n):
+                third = dot(across_rate[j], kin.jacobian[k]) + dot(across[j], column_rates[k])
+                value = 2.0 * (dot(slope[j], slope[k]) + third) - dot(multiplier, self.second[j][k])
+                hessian[j][k] = hessian[k][j] = value - 2.0 * self.weight[j] if j == k else value
+        return hessian
+
+
+def expand(robot: "Robot", q: Vec, d: Vec, home: Vec) -> Expansion:
+    """Expand objective and constraint at q.
+
+    Args:
+        robot: The robot; every joint must be revolute.
+        q: Joint positions [rad], n scalars.
+        d: Unit hitting direction in the table plane, 2.
+        home: The configuration to stay close to [rad], n.
+    """
+    kin = forward_kinematics(robot.chain, q)
+    direction = [d[0], d[1], 0.0]
+    weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
+    gain = [d[0] * column[0] + d[1] * column[1] for column in kin.jacobian]
+    second = _second_derivatives(kin)
+    slope = [[d[0] * entry[0] + d[1] * entry[1] for entry in row] for row in second]
+    gradient = [2.0 * dot(slope[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
+    return Expansion(kin, gradient, direction, gain, second, slope, weight)
+
+
+def _second_derivatives(kin: Kinematics) -> list[list[Vec]]:
+    """d^2 p / dq_j dq_k = z_min x J_max."""
+    n = len(kin.axes)
+    upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in range(n) for k in range(j, n)}
+    return [[upper[min(j, k), max(j, k)] for k in range(n)] for j in range(n)]
+
+
+def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
+    """Derivatives of the joint axes and of the columns of the Jacobian where the joints move at these rates."""
+    turning: Vec = [0.0, 0.0, 0.0]
+    origin_rate: Vec = [0.0, 0.0, 0.0]
+    previous: Vec = [0.0, 0.0, 0.0]
+    tip_rate = [dot([column[row] for column in kin.jacobian], rate) for row in range(3)]
+    axis_rates, column_rates = [], []
+    for axis, origin, speed in zip(kin.axes, kin.origins, rate, strict=True):
+        origin_rate = add(origin_rate, cross(turning, subtract(origin, previous)))
+        previous = origin
+        axis_rate = cross(turning, axis)
+        axis_rates.append(axis_rate)
+        lever = cross(axis_rate, subtract(kin.tip, origin))
+        column_rates.append(add(lever, cross(axis, subtract(tip_rate, origin_rate))))
+        turning = add(turning, scale(axis, speed))
+    return axis_rates, column_rates
+
+
+def newton_step(robot: "Robot") -> Any:
+    """Build one Newton step as an SX function ``(q, p, d, q0) -> (next q, |step|)``.
+
+    Args:
+        robot: The robot; every joint must be revolute.
+
+    Returns:
+        A ``casadi.Function`` with arguments of width n, 3, 2, n.
+    """
+    import casadi as ca
+
+    (q_sx, q), (p_sx, p), (d_sx, d), (home_sx, home) = (
+        symbols(name, width) for name, width in (("q", robot.n), ("p", 3), ("d", 2), ("q0", robot.n))
+    )
+    here = expand(robot, q, d, home)
+    following, length = shortened(q, _reduced_step(here, subtract(p, here.kin.tip), basic_joints(robot)))
+    return ca.Function("hitting_configuration", [q_sx, p_sx, d_sx, home_sx], [following, length])
+
+
+def shortened(q: Vec, step: Vec) -> tuple[Any, Scalar]:
+    """Return ``q + step``, the step not longer than ``MAX_STEP``, and the length that it would have had."""
+    import casadi as ca
+
+    length = ca.sqrt(dot(step, step))
+    factor = ca.fmin(1.0, MAX_STEP / ca.fmax(length, 1e-12))
+    return ca.vertcat(*add(q, scale(step, factor))), length
+
+
+def safeguard(pivot: Scalar) -> Scalar:
+    """Keep a pivot of the negative Hessian away from zero and positive."""
+    import casadi as ca
+
+    return ca.fmax(ca.fabs(pivot), MIN_PIVOT)
+
+
+def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Vec:
+    """Newton step: basic joints close the miss, free joints climb the reduced gradient."""
+    import casadi as ca
+
+    n, jacobian = here.n, here.kin.jacobian
+    inverse = inverse3([jacobian[j] for j in basic])
+    multiplier = [dot([inverse[b][row] for b in range(3)], [here.gradient[j] for j in basic]) for row in range(3)]
+    null = _null_space(jacobian, inverse, basic)
+    normal: Vec = [0.0] * n
+    for b, joint in enumerate(basic):
+        normal[joint] = dot(inverse[b], miss)
+    hessian = here.hessian(multiplier)
+    curved = [[dot(row, column) for row in hessian] for column in null]  # H Z
+    lower = [[-dot(null[i], curved[j]) for j in range(i + 1)] for i in range(len(null))]
+    right = [dot(column, here.gradient) + dot(bent, normal) for column, bent in zip(null, curved, strict=True)]
+    climb = substitute(*factorize(lower, safeguard), right)
+    step = normal
+    for amount, column in zip(climb, null, strict=True):
+        step = add(step, scale(column, amount))
+    return [ca.SX(value) for value in step]
+
+
+def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, int]) -> list[Vec]:
+    """Columns of Z, one per free joint: moving it alone, with the basic joints keeping the tip in place."""
+    columns = []
+    for j in range(len(jacobian)):
+        if j not in basic:
+            column: Vec = [0.0] * len(jacobian)
+            column[j] = 1.0
+            for b, joint in enumerate(basic):
+                column[joint] = -dot(inverse[b], jacobian[j])
+            columns.append(column)
+    return columns
+
+
+def basic_joints(robot: "Robot") -> tuple[int, int, int]:
+    """Choose the joints through which the tip position is eliminated.
+
+    The three whose Jacobian is typically the best part of the arm's: the largest median over configurations near the
+    base of ``|det J_B| / sqrt(det J J^T)``. (The largest least value would be decided by a few odd configurations.)
+    """
+    import pinocchio as pin
+
+    random = np.random.default_rng(0)
+    low, high = np.maximum(robot.base - 0.7, robot.position_lower), np.minimum(robot.base + 0.7, robot.position_upper)
+    data, tip = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    jacobians = np.array(
+        [pin.computeFrameJacobian(robot.model, data, random.uniform(low, high), tip, frame)[:3] for _ in range(64)]
+    )
+    volume = np.sqrt(np.linalg.det(jacobians @ jacobians.transpose(0, 2, 1)))
+
+    def share(joints: tuple[int, ...]) -> float:
+        return float(np.median(np.abs(np.linalg.det(jacobians[:, :, list(joints)])) / volume))
+
+    best = max(combinations(range(robot.n), 3), key=share)
+    return best[0], best[1], best[2]
