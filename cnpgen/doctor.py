@@ -233,7 +233,7 @@ def _compiler() -> str:
 
 
 def _cache_folder() -> str:
-    from cnpgen.kernels.library import default_cache_folder
+    from cnpgen.kernels.cache import default_cache_folder
 
     return str(default_cache_folder())
 

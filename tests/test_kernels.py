@@ -23,7 +23,7 @@ from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler,
 from cnpgen.kernels.emit import emit
 from cnpgen.kernels.interpreted import BLOCK, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.library import KernelLibrary, choose_backend, default_cache_folder
+from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.mapped import MappedKernel
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
 
@@ -622,18 +622,6 @@ def test_a_compiler_that_makes_wrong_code_is_found_out(own_cache, monkeypatch):
         choose_backend("compiled")
 
 
-@needs_compiler
-def test_a_cache_that_cannot_be_written_is_replaced_after_one_warning(tmp_path, monkeypatch, fresh_compiler):
-    (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "file" / "cache"))
-    backend, folder, texts = chosen_with_warnings()
-    assert backend == "compiled"
-    assert len(texts) == 1
-    assert f"cannot write the kernel cache {tmp_path / 'file' / 'cache'}" in texts[0]
-    assert str(folder) in texts[0]
-    assert folder.is_dir()
-
-
 def test_a_tape_that_cannot_be_cached_is_used_nevertheless(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     (result,) = library_in(tmp_path / "file", "numpy").load(doubling)(np.ones((1, 3)))
@@ -668,29 +656,6 @@ def test_the_other_backends_need_no_compiler(own_cache, monkeypatch, wanted):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
     assert chosen_with_warnings(wanted) == (wanted, own_cache, [])
-
-
-def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
-    monkeypatch.setenv("CNPGEN_CACHE", "/a/b")
-    assert default_cache_folder() == Path("/a/b")
-    monkeypatch.delenv("CNPGEN_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/x")
-    assert default_cache_folder() == Path("/x/cnpgen")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert default_cache_folder() == tmp_path / ".cache" / "cnpgen"
-
-
-def test_a_user_without_home_folder_is_told_what_to_set(monkeypatch):
-    for name in ("CNPGEN_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-
-    def no_home() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", no_home)
-    with pytest.raises(MachineError, match="CNPGEN_CACHE"):
-        choose_backend()
 
 
 @needs_compiler

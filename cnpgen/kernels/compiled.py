@@ -2,6 +2,7 @@
 
 import ctypes
 import hashlib
+import logging
 import os
 import platform
 import shutil
@@ -21,6 +22,7 @@ from cnpgen.kernels.tape import Tape
 FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w")
 LONG = 6000  # instructions: above, GCC's register allocator takes minutes at -O2 and gains nothing
 COMPILE_SECONDS = 300
+_LOG = logging.getLogger(__name__)
 
 
 class CompiledKernel(Kernel):
@@ -129,6 +131,7 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     try:
         if found := find_library(libraries, stem):
             return found
+        _LOG.info("compiling kernels, once per machine")
         libraries.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
             source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"

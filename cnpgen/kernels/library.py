@@ -3,7 +3,6 @@
 import hashlib
 import inspect
 import json
-import os
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
@@ -15,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels.cache import default_cache_folder, writable_folder
 from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler
 from cnpgen.kernels.interpreted import InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
@@ -23,6 +23,7 @@ from cnpgen.kernels.tape import CODES, Loop, Tape, tape_from_function
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
+SLOWER = "10 to 20 times slower than compiled code"  # benchmarks/generator.py measures it: 9 to 24
 
 
 @dataclass
@@ -111,20 +112,6 @@ def _source_digest(builder: Callable[..., Any]) -> str:
     return hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
 
 
-def default_cache_folder() -> Path:
-    """``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
-
-    Raises:
-        MachineError: None of them is known.
-    """
-    if os.environ.get("CNPGEN_CACHE"):
-        return Path(os.environ["CNPGEN_CACHE"])
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
-    except RuntimeError as error:
-        raise MachineError("this user has no home folder to keep kernels in: set CNPGEN_CACHE to a folder") from error
-
-
 def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     """Decide which backend runs and where its cache is; warn once where it is not the fastest.
 
@@ -140,7 +127,7 @@ def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     """
     if wanted is not None and wanted not in BACKENDS:
         raise UsageError(f"backend {wanted!r} does not exist: expected one of {', '.join(BACKENDS)}")
-    folder = _writable(default_cache_folder())
+    folder = writable_folder(default_cache_folder())
     if wanted == "numpy":
         return "numpy", folder
     if wanted == "casadi":
@@ -150,26 +137,9 @@ def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     except MachineError as error:
         if wanted == "compiled":
             raise
-        warnings.warn(f"{error}; running on the NumPy backend, about ten times slower", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{error}; running on the NumPy backend, {SLOWER}", RuntimeWarning, stacklevel=2)
         return "numpy", folder
     return "compiled", folder
-
-
-def _writable(folder: Path) -> Path:
-    """Return the folder, or a fresh temporary one with a warning if it cannot be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError as error:
-        fallback = Path(tempfile.mkdtemp(prefix="cnpgen-cache-"))
-        warnings.warn(
-            f"cannot write the kernel cache {folder} ({error.strerror or error});"
-            f" kernels are built again into {fallback} (set CNPGEN_CACHE to a writable folder)",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-        return fallback
 
 
 def _try_compiler(folder: Path) -> None:
