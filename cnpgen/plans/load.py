@@ -14,7 +14,7 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
-from cnpgen.store.shard import _opened as opened_hdf5
+from cnpgen.store.shard import opened_hdf5
 from cnpgen.trajectory.boundary import Boundary
 
 

@@ -19,7 +19,7 @@ from cnpgen.store.documents import canonical_sha256, plain
 
 Array = NDArray[np.float64]
 
-_JUDGED_BY = ("tolerance", "budget", "weight")  # of constraints: how strictly a plan is judged, not what it is a plan for
+_JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,9 @@ def record_problem(problem: Problem) -> ProblemRecord:
 
 def _meaning(record: ProblemRecord) -> dict[str, Any]:
     """Reduce a problem to what its plans mean."""
-    kept = {key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}}
+    kept = {
+        key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}
+    }
     robot = {key: value for key, value in kept["robot"].items() if key not in {"urdf", "base"}}
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
     constraints = {

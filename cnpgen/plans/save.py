@@ -12,8 +12,7 @@ from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, plan_fields
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files import write_file
-from cnpgen.store.shard import _create as create_hdf5
-from cnpgen.store.shard import field_attributes
+from cnpgen.store.shard import create_hdf5, field_attributes
 
 
 def save_plans(path: str | Path, plans: Plans) -> None:

@@ -119,7 +119,7 @@ def _encode(
     import h5py
 
     buffer = io.BytesIO()
-    with h5py.File(_create(buffer)) as file:
+    with h5py.File(create_hdf5(buffer)) as file:
         for field in fields:
             stored = storage_dtype(field, dtype)
             dataset = file.create_dataset(field.name, data=columns[field.name], dtype=stored, track_times=False)
@@ -128,8 +128,8 @@ def _encode(
     return buffer.getbuffer()
 
 
-def _create(buffer: io.BytesIO) -> Any:
-    """Create an HDF5 file in ``buffer``.
+def create_hdf5(buffer: io.BytesIO) -> Any:
+    """Create an HDF5 file in ``buffer``; wrap it in ``h5py.File``.
 
     The file format is pinned. The root group stores no times, which ``h5py.File`` has only lately learnt to leave out.
     Datasets start at multiples of 64 bytes, so that they can be mapped into memory as aligned arrays.
@@ -145,8 +145,13 @@ def _create(buffer: io.BytesIO) -> Any:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a shard for reading, without handles that outlive the block and could be shared by processes."""
+def opened_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file for reading, without handles that outlive the block and could be shared by processes.
+
+    Raises:
+        DatasetError: The file is missing, damaged or cut off, found out on opening or by what the block reads.
+        MachineError: The system would not let us read it.
+    """
     import h5py
 
     if not path.is_file():
@@ -174,7 +179,7 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
         DatasetError: The file is missing, damaged or cut off, or has no such field.
         MachineError: The system would not let us read it.
     """
-    with _opened(path) as file:
+    with opened_hdf5(path) as file:
         known = list(file)
         for name in fields or ():
             if name not in known:
@@ -198,7 +203,7 @@ def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str,
         DatasetError: The file is missing, damaged or cut off, or has no such attribute.
         MachineError: The system would not let us read it.
     """
-    with _opened(path) as file:
+    with opened_hdf5(path) as file:
         values = {name: file.attrs[name] for name in (file.attrs if names is None else names)}
         return {name: value if isinstance(value, str) else int(value) for name, value in values.items()}
 
@@ -225,7 +230,7 @@ def read_schema(path: Path) -> dict[str, StoredField]:
         DatasetError: The file is missing, damaged or cut off.
         MachineError: The system would not let us read it.
     """
-    with _opened(path) as file:
+    with opened_hdf5(path) as file:
         return {
             name: StoredField(getattr(item, "shape", ()), getattr(item, "dtype", None), dict(item.attrs))
             for name, item in file.items()
