@@ -13,7 +13,6 @@ from cnpgen.recipes import Problem
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verify.path import PathWorld
-from cnpgen.verify.sweep import sweep, travel_of
 from cnpgen.verify.world import World
 
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
@@ -149,63 +148,19 @@ def test_skipping_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal
     assert_nothing_is_hidden(world.object_distances(), objects)
 
 
-def test_most_states_are_skipped(monkeypatch: pytest.MonkeyPatch):
+def test_nearly_all_states_are_skipped(monkeypatch: pytest.MonkeyPatch):
     problem, plan = PROBLEMS["heavy-object"], PLANS["transport"]
     states = Motion(np.array([plan["path"]]), np.array([plan["rate"]])).at(np.linspace(0, 1, 1500))
     world = PathWorld(problem, ROBOTS["heavy-object"])
     tops = np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15
     world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, tops)
     calls = []
-    measure = world._object_scene.object_distances
-    monkeypatch.setattr(world._object_scene, "object_distances", lambda *pose: (calls.append(1), measure(*pose))[1])
+    for name in ("object_apart", "segment_apart"):
+        measure = getattr(world._scene, name)
+        monkeypatch.setattr(world._scene, name, lambda *where, measure=measure: (calls.append(1), measure(*where))[1])
     world.object_distances()
-    assert 0 < len(calls) < 600
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_a_sweep_finds_the_smallest_of_any_functions_that_change_no_faster_than_the_bodies_move(seed):
-    random = np.random.default_rng(seed)
-    count, bodies, obstacles = int(random.integers(1, 300)), int(random.integers(1, 4)), int(random.integers(1, 4))
-    steps = random.uniform(0, 0.1, (bodies, count)) * (random.random((bodies, count)) < random.random())
-    steps[:, 0] = 0
-    travel = np.cumsum(steps, axis=1)
-    truth = random.uniform(0, 2, (bodies, obstacles, 1)) + np.cumsum(
-        steps[:, None] * random.uniform(-1, 1, (bodies, obstacles, count)), axis=2
-    )
-    found = sweep([lambda k, body=body: truth[body, :, k].tolist() for body in range(bodies)], travel)
-    values = np.array(found)
-    assert values.shape == truth.shape
-    assert values.min() == truth.min()
-    assert np.all(values <= truth + 1e-12)
-
-
-def test_a_sweep_stops_at_the_floor():
-    calls = []
-
-    def measure(k: int) -> list[float]:
-        calls.append(k)
-        return [0.0]
-
-    found = sweep([measure], np.linspace(0, 50, 1001)[None], floor=0.0)
-    assert len(calls) == 2
-    np.testing.assert_allclose(found[0], 0, atol=1e-11)
-
-
-def test_travel_is_what_the_fastest_vertex_covers():
-    points = np.zeros((2, 3, 4))
-    points[0, 0] = [0, 1, 1, 4]
-    points[1, 2] = [0, 0.5, 2.5, 2.5]
-    np.testing.assert_allclose(travel_of(points), [0, 1, 3, 6])
-
-
-def test_no_point_of_the_object_moves_further_than_its_travel():
-    world = PathWorld(PROBLEMS["heavy-object"], ROBOTS["heavy-object"])
-    world.set_path(*wandering(world.robot, seed=4), np.zeros(2))
-    travel, random = travel_of(world.object_corners()), np.random.default_rng(5)
-    for offset in random.uniform(-0.5, 0.5, (20, 3)) * [0.2, 0.2, 0.3]:
-        point = np.einsum("ijk,j->ik", world.tip_rotation, offset) + world.tip_position
-        moved = np.linalg.norm(point[:, :, None] - point[:, None], axis=0)
-        assert np.all(moved <= np.abs(travel[:, None] - travel) + 1e-12)
+    world.segment_distances()
+    assert 2 <= len(calls) < 100
 
 
 def test_a_path_is_forgotten_when_the_next_one_is_set():

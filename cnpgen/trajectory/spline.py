@@ -45,14 +45,21 @@ def pieces(control: Array, degree: int) -> Array:
     Returns:
         Coefficients of the powers of (s - left knot), highest first, shape (D + 1, spans, N, ...).
     """
-    points = control.shape[1]
-    left = np.arange(points - degree) / (points - degree)
+    matrices = taylor(control.shape[1], degree)[::-1]
     columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
-    taylor = [
-        np.moveaxis(basis(left, points, degree, order) @ columns, 0, 1) / factorial(order)  # motion by motion
-        for order in range(degree, -1, -1)
-    ]
-    return np.stack(taylor).reshape(degree + 1, len(left), len(control), *control.shape[2:])
+    powers = np.stack([np.moveaxis(matrix @ columns, 0, 1) for matrix in matrices])  # motion by motion
+    return powers.reshape(*matrices.shape[:2], len(control), *control.shape[2:])
+
+
+@cache
+def taylor(points: int, degree: int) -> Array:
+    """Return the Taylor coefficients of every basis function at every left knot, lowest power first.
+
+    Returns:
+        Shape (D + 1, spans, C): ``taylor(C, D)[k] @ control_points`` are the coefficients of (s - left knot)^k.
+    """
+    left = np.arange(points - degree) / (points - degree)
+    return np.stack([basis(left, points, degree, order) / factorial(order) for order in range(degree + 1)])
 
 
 def pick(coefficients: Array, s: Array) -> tuple[Array, Array]:

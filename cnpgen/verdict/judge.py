@@ -13,6 +13,7 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.verdict.course import course
 from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
 from cnpgen.verdict.sampling import Samples, sample, time_table
@@ -120,11 +121,10 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
     samples = _samples(plan, step)
     if isinstance(samples, Verdict):
         return samples
-    states = plan.motion.at(samples.s)
-    q, dq, ddq, jerk = (values[0].T for values in (states.q, states.dq, states.ddq, states.jerk))
-    if not np.all(np.isfinite([q, dq, ddq])):
+    states = course(plan.motion, samples.s)
+    if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(q, dq, ddq, plan.tops)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops)
     margins = [
         *boundary_margins(states, plan.boundary, samples, world.robot.joint_names),
         *constraint_margins(plan.problem, world, samples),
@@ -132,7 +132,7 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
     return Verdict(
         _reason(margins),
         by_name(margins),
-        _metrics(plan.problem, world, samples, jerk),
+        _metrics(plan.problem, world, samples, states.jerk),
         paper_rule(plan.problem, world, plan.tops, plan.goal_xyz),
         len(samples.s),
     )

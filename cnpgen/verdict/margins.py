@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.recipes import Problem
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import States
+from cnpgen.verdict.course import Course
 from cnpgen.verdict.sampling import Samples
 from cnpgen.verdict.verdict import Margin, Reason
 from cnpgen.verify.path import PathWorld
@@ -28,11 +28,11 @@ BOUNDARY = {
 _TINY = 1e-200  # stands for an allowed excess of 0, so that the largest excess can still be found
 
 
-def boundary_margins(states: States, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:
+def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:
     """Compare the ends of a motion with its boundary conditions.
 
     Args:
-        states: Samples of one motion, both ends among them.
+        states: States of one motion, both ends among them.
         boundary: Boundary conditions of one motion.
         samples: When and at which phase they are.
         joints: Names of the joints.
@@ -41,7 +41,7 @@ def boundary_margins(states: States, boundary: Boundary, samples: Samples, joint
     for what, (name, unit, allowed) in BOUNDARY.items():
         wanted = [getattr(boundary, f"{end}_{what}") for end in ("start", "goal")]
         pairs = [(k, want[0]) for k, want in zip((0, -1), wanted, strict=True) if want is not None]
-        found = np.array([getattr(states, what)[0, k] for k, _ in pairs])
+        found = np.array([getattr(states, what)[:, k] for k, _ in pairs])
         error = np.abs(found - np.array([want for _, want in pairs]))
         end, joint = np.unravel_index(np.argmax(error), error.shape)
         k, want = pairs[int(end)]
@@ -79,22 +79,25 @@ def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> 
 
 
 def _margin(constraint: Constraint, condition: Condition, world: PathWorld, samples: Samples) -> Margin:
-    g = np.array([np.broadcast_to(np.asarray(value, np.float64), samples.s.shape) for value in condition.g])
+    g = np.empty((len(condition.g), len(samples.s)))
+    for row, value in zip(g, condition.g, strict=True):
+        row[:] = value
     wider = constraint.funnel(condition, samples.s, world.tip_position[:, 0])
-    below, above = condition.lower[:, None] - g - wider, g - condition.upper[:, None] - wider
-    excess = np.maximum(below, above)
-    excess[np.isnan(excess)] = np.inf
+    below, above = condition.lower[:, None] - g, g - condition.upper[:, None]
+    excess = np.maximum(below, above) - wider
     allowed = constraint.allowed(condition)
-    part, k = np.unravel_index(np.argmax(excess / np.maximum(allowed, _TINY)[:, None]), excess.shape)
+    share = excess / np.maximum(allowed, _TINY)[:, None]  # argmax finds the first that is nan, if any is
+    part, k = divmod(int(np.argmax(share)), len(samples.s))
     is_low = below[part, k] > above[part, k]
+    worst = float(excess[part, k])
     return Margin(
         condition.name,
         constraint.reason,
         condition.unit,
-        _part(condition, int(part), world.robot.joint_names),
+        _part(condition, part, world.robot.joint_names),
         value=float(g[part, k]),
         bound=float(condition.lower[part] - wider[k] if is_low else condition.upper[part] + wider[k]),
-        excess=float(excess[part, k]),
+        excess=np.inf if np.isnan(worst) else worst,
         allowed=float(allowed[part]),
         time=float(samples.t[k]),
         phase=float(samples.s[k]),

@@ -85,13 +85,14 @@ def _is_on_table(table: Table, tip: Array) -> bool:
 
 
 def _is_clear(problem: "Problem", world: "PathWorld", tops: Array) -> bool:
-    half = 0.0 if problem.object is None else problem.object.size[2] / 2
-    corners, centre = world.object_corners(), world.tip_position
+    size = np.zeros(3) if problem.object is None else np.array(problem.object.size)
+    centre, corners, reach = world.tip_position, world.object_corners(), np.linalg.norm(size) / 2
     for box, top in zip(problem.obstacle, tops, strict=True):
-        low = np.array([box.x.low, box.y.low, -np.inf if box.height is None else top - box.height])
-        high = np.array([box.x.high, box.y.high, top])
-        apart = centre - np.clip(centre, low[:, None], high[:, None])
-        depth = np.minimum(corners - low[:, None], high[:, None] - corners).min(axis=1)
-        if not (np.all(np.linalg.norm(apart, axis=0) > half - OBJECT) and np.all(depth < OBJECT)):
+        low = np.array([box.x.low, box.y.low, -np.inf if box.height is None else top - box.height])[:, None]
+        high = np.array([box.x.high, box.y.high, top])[:, None]
+        apart = np.linalg.norm(centre - np.clip(centre, low, high), axis=0)
+        near = corners[..., apart < reach]  # elsewhere no corner is inside
+        depth = np.minimum(near - low, high - near).min(axis=1)
+        if not (np.all(apart > size[2] / 2 - OBJECT) and np.all(depth < OBJECT)):
             return False
     return True

@@ -1,6 +1,5 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
-from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -8,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.verify.scene import Scene
-from cnpgen.verify.sweep import Measure, sweep, travel_of
+from cnpgen.verify.scene import ENDLESS, Scene
+from cnpgen.verify.separation import Box, cuboid_gaps, gaps, separation
+from cnpgen.verify.sweep import Measure, Separate, sweep
+from cnpgen.verify.trace import trace
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem
@@ -45,16 +46,16 @@ class PathWorld:
         import pinocchio as pin
 
         self.robot = robot
+        self._obstacles = problem.obstacle
         self._model = robot.model
         self._data = self._model.createData()
         self._pool = pin.ModelPool(self._model, 1)
         self._tip = self._model.getFrameId(robot.tip)
-        self._object_size = None if problem.object is None else problem.object.size
-        self._n_boxes = len(problem.obstacle)
-        self._segment_scene = Scene(problem.obstacle, None, 1)
-        self._object_scene = Scene(problem.obstacle, self._object_size, 0)
+        self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
+        self._object_size = None if problem.object is None else np.array(problem.object.size)
+        self._scene = Scene(problem.obstacle, None if problem.object is None else problem.object.size, 1)
         rest = np.zeros((robot.n, 1))
-        self.set_path(robot.base[:, None], rest, rest, np.zeros(self._n_boxes))
+        self.set_path(robot.base[:, None], rest, rest, np.zeros(len(problem.obstacle)))
 
     def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array) -> None:
         """Move to K states.
@@ -65,21 +66,31 @@ class PathWorld:
             ddq: Joint accelerations [rad/s^2], shape (n, K).
             tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
         """
-        import pinocchio as pin
-
         self.q, self.dq, self.ddq = q, dq, ddq
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
-        move, place = pin.forwardKinematics, pin.updateFramePlacement
-        model, data, tip = self._model, self._data, self._tip
-        poses = np.empty((q.shape[1], 4, 4))
-        for k, state in enumerate(np.ascontiguousarray(q.T)):
-            move(model, data, state)
-            poses[k] = place(model, data, tip).homogeneous
-        self.tip_position = np.ascontiguousarray(poses[:, :3, 3].T)
-        self.tip_rotation = np.ascontiguousarray(poses[:, :3, :3].transpose(1, 2, 0))
-        self._segment_scene.set_tops(tops.tolist())
-        self._object_scene.set_tops(tops.tolist())
+        self._segments: Array | None = None
+        self._boxes = [
+            Box(
+                np.array([box.x.low, box.y.low, top - (box.height or ENDLESS)]), np.array([box.x.high, box.y.high, top])
+            )
+            for box, top in zip(self._obstacles, tops.tolist(), strict=True)
+        ]
+        self._scene.set_tops(tops.tolist())
+        self._move(with_skeleton=bool(self._boxes))
+
+    def _move(self, *, with_skeleton: bool) -> None:
+        """Run the forward kinematics of every state and keep where the tip is, and the skeleton."""
+        frame, n = self._model.frames[self._tip], self.robot.n
+        used = sorted({*self._skeleton.ravel().tolist()} - {n}) if with_skeleton else []
+        joints = [frame.parentJoint, *(point + 1 for point in used)]
+        rotation, points = trace(self._model, self._data, self.q, joints)
+        placement = frame.placement
+        self.tip_rotation = np.tensordot(placement.rotation.T, rotation, axes=(1, 1)).transpose(1, 0, 2)
+        self.tip_position = np.tensordot(placement.translation, rotation, axes=(0, 1)) + points[0]
+        if with_skeleton:
+            origins = dict(zip([*used, n], [*points[1:], self.tip_position], strict=True))
+            self._segments = np.array([[origins[a], origins[b]] for a, b in self._skeleton.tolist()])
 
     @property
     def torque(self) -> Array:
@@ -128,16 +139,18 @@ class PathWorld:
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
         """
-        segments = self.segments()
+        segments, boxes = self.segments(), self._boxes
+        ends = [(segment, box) for segment in segments for box in boxes]
         if not np.all(np.isfinite(segments)):
-            return self._unknown(len(segments) * self._n_boxes)
+            return self._unknown(len(ends))
+        corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
+        bounds = [np.maximum(gaps(low, high, box), 0.0) for low, high in corners for box in boxes]
 
-        def measure(segment: Array, k: int) -> list[float]:
-            a, b = segment[..., k].tolist()
-            return self._segment_scene.segment_distances([(a, b)])
+        def measure(pair: int, k: int) -> tuple[float, Array]:
+            a, b = ends[pair][0][..., k].tolist()
+            return self._scene.segment_apart(a, b, pair % len(boxes))
 
-        travel = np.array([travel_of(segment) for segment in segments])
-        return self._swept([partial(measure, segment) for segment in segments], travel, floor=0.0)
+        return self._swept(bounds, measure, lambda pair, direction: separation(*ends[pair], direction))
 
     def object_distances(self) -> list[Array]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
@@ -148,18 +161,18 @@ class PathWorld:
         Raises:
             RecipeError: The problem has no object.
         """
-        corners = self.object_corners()
-        if not np.all(np.isfinite(corners)):
-            return self._unknown(self._n_boxes)
-        positions, rotations = self.tip_position.T.copy(), self.tip_rotation.transpose(2, 0, 1).copy()
+        corners, boxes, size = self.object_corners(), self._boxes, self._object_size
+        if size is None or not np.all(np.isfinite(corners)):
+            return self._unknown(len(boxes))
+        bounds = [cuboid_gaps(self.tip_position, self.tip_rotation, size, box) for box in boxes]
 
-        def measure(k: int) -> list[float]:
-            return self._object_scene.object_distances(positions[k], rotations[k])
+        def measure(box: int, k: int) -> tuple[float, Array]:
+            return self._scene.object_apart(self.tip_position[:, k].copy(), self.tip_rotation[..., k].copy(), box)
 
-        return self._swept([measure], travel_of(corners)[None])
+        return self._swept(bounds, measure, lambda box, direction: separation(corners, boxes[box], direction))
 
-    def _swept(self, measures: list[Measure], travel: Array, floor: float = -np.inf) -> list[Array]:
-        return [distances for body in sweep(measures, travel, floor=floor) for distances in body]
+    def _swept(self, bounds: list[Array], measure: Measure, separate: Separate) -> list[Array]:
+        return list(sweep(np.array(bounds).reshape(len(bounds), self.q.shape[1]), measure, separate))
 
     def object_corners(self) -> Array:
         """Compute the corners of the held object [m], shape (8, 3, K).
@@ -169,24 +182,16 @@ class PathWorld:
         """
         if self._object_size is None:
             raise RecipeError(["a constraint is about the held object, but the problem has no [object]"])
-        offsets = _CORNERS * np.array(self._object_size)
-        return np.asarray(np.tensordot(offsets, self.tip_rotation, axes=(1, 1)) + self.tip_position)
+        return np.asarray(
+            np.tensordot(_CORNERS * self._object_size, self.tip_rotation, axes=(1, 1)) + self.tip_position
+        )
 
     def segments(self) -> Array:
         """Compute both ends of every segment of the robot's skeleton [m], shape (segments, 2, 3, K)."""
-        import pinocchio as pin
-
-        move, model, data, n = pin.forwardKinematics, self._model, self._data, self.robot.n
-        used = sorted({point for segment in self.robot.skeleton for point in segment} - {n})
-        poses = [(joint, data.oMi[joint + 1]) for joint in used]  # references: they follow the kinematics
-        origins = np.zeros((self.q.shape[1], n + 1, 3))
-        origins[:, n] = self.tip_position.T
-        for state, found in zip(np.ascontiguousarray(self.q.T), origins, strict=True):
-            move(model, data, state)
-            for joint, pose in poses:
-                found[joint] = pose.translation
-        pairs = np.array(self.robot.skeleton, np.int64).reshape(-1, 2)
-        return origins.transpose(1, 2, 0)[pairs]
+        if self._segments is None:
+            self._move(with_skeleton=True)
+        assert self._segments is not None
+        return self._segments
 
     def _unknown(self, count: int) -> list[Array]:
         return [np.full(self.q.shape[1], np.nan) for _ in range(count)]

@@ -74,16 +74,34 @@ class Scene:
             segments: Both ends of each segment [m].
         """
         distances: list[float] = []
-        for ((ax, ay, az), (bx, by, bz)), capsule, measures in zip(
-            segments, self._capsules, self._from_capsule, strict=True
-        ):
-            along = bx - ax, by - ay, bz - az
-            length = math.hypot(*along)
-            capsule.halfLength = length / 2
-            self._mover.setRotation(_frame_along(along, length))
-            self._mover.setTranslation(np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2]))
-            distances += [max(distance, 0.0) for distance in self._measure(measures)]
+        for index, (a, b) in enumerate(segments):
+            self._place_segment(index, a, b)
+            distances += [max(distance, 0.0) for distance in self._measure(self._from_capsule[index])]
         return distances
+
+    def segment_apart(self, a: Point, b: Point, obstacle: int) -> tuple[float, Array]:
+        """Measure the distance of one segment from one obstacle.
+
+        Args:
+            a: One end of the segment [m].
+            b: Its other end [m].
+            obstacle: Index of the obstacle.
+
+        Returns:
+            The distance [m], 0 where they meet, and the unit vector of shape (3,) along which they are apart, from the
+            obstacle to the segment.
+        """
+        self._place_segment(0, a, b)
+        distance, direction = self._apart(self._from_capsule[0], obstacle)
+        return max(distance, 0.0), direction
+
+    def _place_segment(self, index: int, a: Point, b: Point) -> None:
+        (ax, ay, az), (bx, by, bz) = a, b
+        along = bx - ax, by - ay, bz - az
+        length = math.hypot(*along)
+        self._capsules[index].halfLength = length / 2
+        self._mover.setRotation(_frame_along(along, length))
+        self._mover.setTranslation(np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2]))
 
     def object_distances(self, position: Array, rotation: Array) -> list[float]:
         """Measure the signed distance of the held object from every obstacle [m], minus the depth where they overlap.
@@ -95,6 +113,27 @@ class Scene:
         self._mover.setRotation(rotation)
         self._mover.setTranslation(position)
         return self._measure(self._from_object)
+
+    def object_apart(self, position: Array, rotation: Array, obstacle: int) -> tuple[float, Array]:
+        """Measure the signed distance of the held object from one obstacle.
+
+        Args:
+            position: Centre of the object [m], shape (3,).
+            rotation: Its rotation matrix, shape (3, 3).
+            obstacle: Index of the obstacle.
+
+        Returns:
+            The distance [m], minus the depth where they overlap, and the unit vector of shape (3,) along which they are
+            apart, from the obstacle to the object.
+        """
+        self._mover.setRotation(rotation)
+        self._mover.setTranslation(position)
+        return self._apart(self._from_object, obstacle)
+
+    def _apart(self, measures: list[Any], obstacle: int) -> tuple[float, Array]:
+        self._result.clear()
+        distance = measures[obstacle](self._mover, self._places[obstacle], self._request, self._result)
+        return distance, -np.array(self._result.normal)
 
     def _measure(self, measures: list[Any]) -> list[float]:
         """Distances of the shape that ``_mover`` places from every obstacle [m]."""

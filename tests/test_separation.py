@@ -1,0 +1,76 @@
+"""Lower bounds of distances are lower bounds, and exact where a face is nearest: checked against Coal."""
+
+import coal
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cnpgen.verify.separation import Box, cuboid_gaps, gaps, separation
+
+SIZE = np.array([0.2, 0.2, 0.3])
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def draw(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, Box]:
+    """Poses of a cuboid near a box: from deep inside to far away, upright, tilted a little or at random."""
+    random = np.random.default_rng(seed)
+    low = random.uniform(-0.3, 0, 3)
+    box = Box(low, low + random.uniform(0.1, 0.6, 3))
+    turn = random.normal(0, 1, (count, 3)) * [0.02, 0.02, 2.0] if seed % 2 else random.normal(0, 3, (count, 3))
+    rotation = Rotation.from_rotvec(turn).as_matrix().transpose(1, 2, 0)
+    position = (box.low + box.high)[:, None] / 2 + random.normal(0, 0.4, (3, count))
+    return position, rotation, box
+
+
+def coal_distance(shape: object, position: np.ndarray, rotation: np.ndarray, box: Box) -> tuple[float, np.ndarray]:
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.gjk_tolerance, request.epa_tolerance = 1e-12, 1e-9
+    block = coal.Box(*(box.high - box.low))
+    place = coal.Transform3s(np.eye(3), (box.low + box.high) / 2)
+    distance = coal.distance(shape, coal.Transform3s(rotation, position), block, place, request, result)
+    return distance, -np.array(result.normal)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_of_a_cuboid_are_never_above_its_distance(seed: int) -> None:
+    position, rotation, box = draw(seed)
+    vertices = np.einsum("vj,ijk->vik", CORNERS * SIZE, rotation) + position
+    bounds = cuboid_gaps(position, rotation, SIZE, box)
+    random, tight, overlapping = np.random.default_rng(seed), 0, 0
+    for k in range(position.shape[1]):
+        distance, direction = coal_distance(coal.Box(*SIZE), position[:, k], rotation[..., k].copy(), box)
+        assert bounds[k] <= distance + 1e-9
+        anywhere = random.normal(size=3)
+        for unit in (direction, anywhere / np.linalg.norm(anywhere)):
+            assert separation(vertices, box, unit)[k] <= distance + 1e-9
+        assert separation(vertices, box, direction)[k] == pytest.approx(distance, abs=1e-8)
+        tight += bool(abs(bounds[k] - distance) < 1e-9)
+        overlapping += distance < 0
+    assert tight > 20
+    assert overlapping > 20
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bounds_of_a_segment_are_never_above_its_distance(seed: int) -> None:
+    middle, rotation, box = draw(seed)
+    half = 0.2 * rotation[:, 2]
+    ends = np.array([middle - half, middle + half])
+    bounds = np.maximum(gaps(ends.min(axis=0), ends.max(axis=0), box), 0.0)
+    for k in range(middle.shape[1]):
+        distance, direction = coal_distance(coal.Capsule(0.0, 0.4), middle[:, k], rotation[..., k].copy(), box)
+        assert bounds[k] <= max(distance, 0.0) + 1e-9
+        assert separation(ends, box, direction)[k] == pytest.approx(distance, abs=1e-8)
+
+
+def test_gaps_along_several_axes_form_a_distance() -> None:
+    low, high = (
+        np.array([[0.3, 0.0, 0.2], [0.4, 0.5, 0.2], [0.0, 0.0, 0.2]]),
+        np.array([[1.0] * 3, [1.0] * 3, [1.0] * 3]),
+    )
+    box = Box(np.array([-1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
+    np.testing.assert_allclose(gaps(low, high, box), [0.5, 0.5, np.sqrt(0.08)], atol=1e-15)
+
+
+def test_of_what_overlaps_the_shallowest_depth_is_the_bound() -> None:
+    low, high = np.array([[0.0], [0.0], [0.9]]), np.array([[1.0], [1.0], [1.5]])
+    assert gaps(low, high, Box(np.zeros(3), np.ones(3)))[0] == pytest.approx(-0.1)

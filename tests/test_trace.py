@@ -1,0 +1,38 @@
+"""Forward kinematics of many states: what Pinocchio says of each."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.errors import MachineError
+from cnpgen.library import load_problem
+from cnpgen.robots.robot import load_robot
+from cnpgen.verify import trace as module
+from cnpgen.verify.trace import trace
+
+
+@pytest.mark.parametrize("name", ["airhockey", "heavy-object"])
+def test_poses_are_those_of_every_single_state(name: str) -> None:
+    robot = load_robot(load_problem(name))
+    model, data, other = robot.model, robot.model.createData(), robot.model.createData()
+    q = np.random.default_rng(0).uniform(-2, 2, (robot.n, 40))
+    joints = [robot.n, 1, 4]
+    rotation, positions = trace(model, data, q, joints)
+    for k, state in enumerate(q.T):
+        pin.forwardKinematics(model, other, state.copy())
+        np.testing.assert_array_equal(rotation[..., k], other.oMi[joints[0]].rotation)
+        for joint, position in zip(joints, positions, strict=True):
+            np.testing.assert_array_equal(position[:, k], other.oMi[joint].translation)
+
+
+def test_arrays_that_are_copies_are_noticed() -> None:
+    robot = load_robot(load_problem("airhockey"))
+    import eigenpy
+
+    before = eigenpy.sharedMemory()
+    eigenpy.sharedMemory(False)
+    try:
+        with pytest.raises(MachineError, match="sharedMemory"):
+            module.trace(robot.model, robot.model.createData(), np.ones((robot.n, 3)), [robot.n])
+    finally:
+        eigenpy.sharedMemory(before)
