@@ -21,7 +21,7 @@ LAYERS = (
     ("kernels",),
     ("pipelines",),
     ("store", "trajectory", "verify"),
-    ("verdict", "plans", "refine", "export", "plan_plots"),
+    ("verdict", "plans", "losses", "refine", "export", "plan_plots"),
     ("make_shard", "make", "validation", "inspection", "describe", "plots", "doctor"),
     ("cli", "__main__", "__init__"),
 )

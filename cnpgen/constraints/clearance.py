@@ -32,6 +32,12 @@ class RobotClearance(Constraint):
         distances = [segment_box_distance(a, b, box) for a, b in segments for box in state.boxes]
         return self._clear(distances)
 
+    def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the distances, negative inside, where ``symbolic`` is zero and has no gradient [m]."""
+        from cnpgen.robots.boxes import signed_segment_box_distance as distance
+
+        return self._clear([distance(a, b, box, hold=state.hold) for a, b in state.segments for box in state.boxes])
+
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the distances with Coal [m]."""
         return self._clear(world.segment_distances())

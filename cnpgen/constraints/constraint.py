@@ -116,6 +116,13 @@ class Constraint(ABC):
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the condition on a motion as SX expressions of the symbolic state."""
 
+    def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State what training penalises: by default ``symbolic``.
+
+        The same condition; overridden where the violation that ``symbolic`` states has no gradient.
+        """
+        return self.symbolic(state)
+
     @abstractmethod
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the same condition with Pinocchio and Coal at the state that ``world`` holds."""

@@ -11,11 +11,13 @@ import tempfile
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.emit import PRELUDE, emit
+from cnpgen.kernels.emit import VECTORS, emit
+from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
 
@@ -30,13 +32,7 @@ class CompiledKernel(Kernel):
 
     def __init__(self, tape: Tape, library: Path) -> None:
         super().__init__(tape)
-        try:
-            self._function = ctypes.CDLL(str(library)).kernel
-        except (OSError, AttributeError) as error:
-            raise MachineError(
-                f"cannot load the compiled kernel {library}: {error}; delete it and run again"
-            ) from error
-        self._function.restype = None
+        self._function = _load(library)
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
@@ -46,6 +42,36 @@ class CompiledKernel(Kernel):
             strides = (ctypes.c_long * len(arguments))(*(argument.strides[0] // 8 for argument in arguments))
             self._function(ctypes.c_long(n), _pointers(arguments), strides, _pointers(results))
         return results
+
+
+class CompiledGridKernel(GridKernel):
+    """A tape with a grid as machine code."""
+
+    def __init__(self, tape: Tape, library: Path) -> None:
+        super().__init__(tape)
+        self._function = _load(library)
+
+    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
+        """Evaluate the grid; see ``GridKernel``."""
+        nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
+        if nodes and lanes:
+            size = ctypes.c_long(nodes), ctypes.c_long(lanes)
+            self._function(*size, _pointers(arguments), _distances(arguments), _pointers(out), _distances(out))
+
+
+def _load(library: Path) -> Any:
+    try:
+        function = ctypes.CDLL(str(library)).kernel
+    except (OSError, AttributeError) as error:
+        raise MachineError(f"cannot load the compiled kernel {library}: {error}; delete it and run again") from error
+    function.restype = None
+    return function
+
+
+def _distances(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_long]":
+    """Distances from component to component and from node to node, in numbers; 0 where there are no nodes."""
+    flat = (stride // array.itemsize for array in arrays for stride in (*array.strides, 0)[:2])
+    return (ctypes.c_long * (2 * len(arrays)))(*flat)
 
 
 def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
@@ -98,7 +124,7 @@ def vector_flags() -> tuple[str, ...]:
 @cache
 def _emitter_digest() -> str:
     source = Path(emit.__code__.co_filename).read_bytes()
-    return hashlib.sha256(source + PRELUDE.encode()).hexdigest()
+    return hashlib.sha256(source + VECTORS.read_bytes()).hexdigest()
 
 
 def library_stem(tape: Tape, compiler: str) -> str:

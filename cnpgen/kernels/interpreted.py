@@ -1,14 +1,15 @@
 """Kernels without a compiler: the tape run by NumPy, one operation at a time on blocks of lanes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Loop, Tape
 
-BLOCK = 4096  # lanes; smaller blocks pay more for Python, larger ones fall out of the cache
+BLOCK = 4096  # lanes or points; smaller blocks pay more for Python, larger ones fall out of the cache
 
 
 def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
@@ -30,6 +31,11 @@ _APPLY: dict[str, Callable[..., Any]] = {
 _PLAIN = {"TWICE", "IF_ELSE_ZERO"}  # not ufuncs: no casting argument
 
 
+Read = Callable[[int, int], Any]  # component of an argument, for the lanes of a block
+Write = Callable[[int, int, Any], None]  # stores a component of a result
+Step = Callable[[list[Array], Read, Write], None]
+
+
 class InterpretedKernel(Kernel):
     """A tape evaluated by NumPy."""
 
@@ -45,14 +51,12 @@ class InterpretedKernel(Kernel):
                 return self._iterate(list(arguments), n, self.tape.loop)
             return self._evaluate(arguments, n)
 
-    def _evaluate(self, arguments: "tuple[Array, ...] | list[Array]", n: int) -> list[Array]:
+    def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
         results = [np.empty((width, n)) for width in self.tape.outputs]
         work = np.empty((self._slots, min(n, BLOCK)))
         for start in range(0, n, BLOCK):
-            stop = min(start + BLOCK, n)
-            rows = [row[: stop - start] for row in work]
-            for step in self._program:
-                step(rows, arguments, results, start, stop)
+            lanes = slice(start, min(start + BLOCK, n))
+            _run(self._program, [row[: lanes.stop - start] for row in work], *_lanes(arguments, results, lanes))
         return results
 
     def _iterate(self, arguments: list[Array], n: int, loop: Loop) -> list[Array]:
@@ -73,7 +77,59 @@ class InterpretedKernel(Kernel):
         return [state, error]
 
 
-Step = Callable[[list[Array], Any, list[Array], int, int], None]
+class InterpretedGridKernel(GridKernel):
+    """A tape with a grid evaluated by NumPy, a few nodes at a time."""
+
+    def __init__(self, tape: Tape) -> None:
+        super().__init__(tape)
+        self._slots, self._program = _allocate(tape)
+
+    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
+        """Evaluate the grid; see ``GridKernel``."""
+        k, n = check_grid(self.tape, self.grid, arguments, out)
+        many = max(BLOCK // max(n, 1), 1)
+        work = np.empty((self._slots, min(many, k), min(n, BLOCK)), self.tape.dtype)
+        with np.errstate(all="ignore"):
+            for node in range(0, k, many):
+                for lane in range(0, n, BLOCK):
+                    nodes, lanes = slice(node, min(node + many, k)), slice(lane, min(lane + BLOCK, n))
+                    rows = [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
+                    _run(self._program, rows, *self._points(arguments, out, nodes, lanes))
+
+    def _points(
+        self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
+    ) -> tuple[Read, Write]:
+        """Return what reads and writes a block of points; rows have shape (nodes, lanes)."""
+        part: dict[str, Any] = {"point": (nodes, lanes), "lane": (None, lanes), "node": (nodes, None), "fixed": ()}
+
+        def read(argument: int, component: int) -> Any:
+            return arguments[argument][(component, *part[self.grid.arguments[argument]])]
+
+        def write(result: int, component: int, value: Any) -> None:
+            if self.grid.results[result] == "point":
+                out[result][component, nodes, lanes] = value
+            else:
+                shape = (nodes.stop - nodes.start, lanes.stop - lanes.start)
+                out[result][component, lanes] += np.broadcast_to(value, shape).sum(axis=0)
+
+        return read, write
+
+
+def _run(program: list[Step], rows: list[Array], read: Read, write: Write) -> None:
+    for step in program:
+        step(rows, read, write)
+
+
+def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tuple[Read, Write]:
+    """Return what reads and writes a block of lanes."""
+
+    def read(argument: int, component: int) -> Any:
+        return arguments[argument][component, lanes]
+
+    def write(result: int, component: int, value: Any) -> None:
+        results[result][component, lanes] = value
+
+    return read, write
 
 
 def _allocate(tape: Tape) -> tuple[int, list[Step]]:
@@ -89,7 +145,7 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
     program: list[Step] = []
     for k, name in enumerate(names):
         if name == "CONST":
-            place[k] = tape.constant[k]
+            place[k] = float(tape.constant[k])  # a Python number: it does not widen float32
             continue
         operands = [place[operand] for operand in _operands(tape, k, name)]
         dying = {operand for operand in _operands(tape, k, name) if last[operand] == k}
@@ -115,15 +171,15 @@ def _operands(tape: Tape, k: int, name: str) -> list[int]:
 
 
 def _bind_input(row: int, argument: int, component: int) -> Step:
-    def step(rows: list[Array], arguments: Any, _results: list[Array], start: int, stop: int) -> None:
-        np.copyto(rows[row], arguments[argument][component, start:stop])
+    def step(rows: list[Array], read: Read, _write: Write) -> None:
+        np.copyto(rows[row], read(argument, component))
 
     return step
 
 
 def _bind_output(operand: Any, result: int, component: int) -> Step:
-    def step(rows: list[Array], _arguments: Any, results: list[Array], start: int, stop: int) -> None:
-        results[result][component, start:stop] = rows[operand] if isinstance(operand, int) else operand
+    def step(rows: list[Array], _read: Read, write: Write) -> None:
+        write(result, component, rows[operand] if isinstance(operand, int) else operand)
 
     return step
 
@@ -132,7 +188,7 @@ def _bind(name: str, operands: list[Any], row: int) -> Step:
     apply = _APPLY[name]
     options = {} if name in _PLAIN else {"casting": "unsafe"}
 
-    def step(rows: list[Array], _arguments: Any, _results: list[Array], _start: int, _stop: int) -> None:
+    def step(rows: list[Array], _read: Read, _write: Write) -> None:
         values = [rows[operand] if isinstance(operand, int) else operand for operand in operands]
         apply(*values, out=rows[row], **options)
 

@@ -15,11 +15,13 @@ import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.cache import default_cache_folder, writable_folder
-from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler
-from cnpgen.kernels.interpreted import InterpretedKernel
+from cnpgen.kernels.compiled import CompiledGridKernel, CompiledKernel, compile_tape, find_compiler
+from cnpgen.kernels.grid import GridKernel
+from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.mapped import MappedKernel
-from cnpgen.kernels.tape import CODES, Loop, Tape, tape_from_function
+from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
+from cnpgen.kernels.tape import CODES, Dtype, Grid, Loop, Tape, tape_from_function
+from cnpgen.recipes import Problem, resolved
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
@@ -51,18 +53,46 @@ class KernelLibrary:
             loop: How to iterate it, or None.
             parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
         """
-        wanted = inspect.signature(builder).parameters
-        given = {name: value for name, value in self.arguments.items() if name in wanted}
+        given = self._given(builder)
         if self.backend == "casadi":
             function = builder(**given, **parameters)
             return MappedKernel(tape_from_function(function, loop), function)
-        tape = self._tape(builder, loop, given, parameters)
+        tape = self._tape(builder, given, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
         return CompiledKernel(tape, compile_tape(tape, self.cache_folder))
 
+    def load_grid(self, builder: Callable[..., Any], grid: Grid, *, dtype: Dtype, **parameters: Any) -> GridKernel:
+        """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
+
+        Args:
+            builder: As for ``load``.
+            grid: What its arguments and results vary over.
+            dtype: What it computes with.
+            parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
+        """
+        given = self._given(builder)
+        if self.backend == "casadi":
+            function = builder(**given, **parameters)
+            return MappedGridKernel(tape_from_function(function, grid=grid, dtype=dtype), function)
+        tape = self._tape(builder, given, parameters, grid=grid, dtype=dtype)
+        if self.backend == "numpy":
+            return InterpretedGridKernel(tape)
+        return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
+
+    def _given(self, builder: Callable[..., Any]) -> dict[str, Any]:
+        wanted = inspect.signature(builder).parameters
+        return {name: value for name, value in self.arguments.items() if name in wanted}
+
     def _tape(
-        self, builder: Callable[..., Any], loop: Loop | None, given: Mapping[str, Any], parameters: Mapping[str, Any]
+        self,
+        builder: Callable[..., Any],
+        given: Mapping[str, Any],
+        parameters: Mapping[str, Any],
+        *,
+        loop: Loop | None = None,
+        grid: Grid | None = None,
+        dtype: Dtype = "float64",
     ) -> Tape:
         import importlib.metadata
 
@@ -72,6 +102,8 @@ class KernelLibrary:
             "versions": [importlib.metadata.version(name) for name in ("casadi", "pin")],
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
+            "grid": [grid.arguments, grid.results] if grid else None,
+            "dtype": dtype,
             "parameters": parameters,
         }
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
@@ -79,7 +111,7 @@ class KernelLibrary:
         try:
             return Tape.from_bytes(path.read_bytes())
         except (OSError, ValueError):
-            tape = tape_from_function(builder(**given, **parameters), loop)
+            tape = tape_from_function(builder(**given, **parameters), loop, grid=grid, dtype=dtype)
             _store(path, tape.to_bytes())
             return tape
 
@@ -101,7 +133,7 @@ def _package_digest() -> str:
     """Digest of the package's own SX code: kernels are rebuilt when it changes."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for folder in ("robots", "kernels", "constraints", "pipelines"):
+    for folder in ("robots", "kernels", "constraints", "pipelines", "losses"):
         for path in sorted((root / folder).glob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
@@ -110,6 +142,13 @@ def _package_digest() -> str:
 def _source_digest(builder: Callable[..., Any]) -> str:
     source = inspect.getsourcefile(builder)
     return hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+
+
+def problem_identity(problem: Problem) -> str:
+    """Digest of what kernels are built from: the problem as it is, wherever it came from, and its URDF."""
+    content = resolved(problem)
+    del content["title"], content["robot"]["urdf"]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode() + problem.urdf_path.read_bytes()).hexdigest()
 
 
 def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:

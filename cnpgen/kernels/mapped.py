@@ -1,9 +1,11 @@
 """Kernels by CasADi's own map: the reference that the fast backends are tested against."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.grid import GridKernel, axis_names, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
 
@@ -30,8 +32,40 @@ class MappedKernel(Kernel):
         return [state, error]
 
     def _evaluate(self, arguments: list[Array], n: int) -> list[Array]:
-        if n == 0:
-            return [np.empty((width, 0)) for width in self.tape.outputs]
-        results = self._function.map(n)(*arguments)
-        results = results if isinstance(results, tuple) else (results,)
-        return [np.ascontiguousarray(np.array(result)) for result in results]
+        return _map(self._function, arguments, n, self.tape.outputs)
+
+
+class MappedGridKernel(GridKernel):
+    """An SX function evaluated point by point by CasADi's virtual machine, in float64 whatever the tape says."""
+
+    def __init__(self, tape: Tape, function: Any) -> None:
+        super().__init__(tape)
+        self._function = function
+
+    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
+        """Evaluate the grid; see ``GridKernel``."""
+        nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
+        everywhere = [
+            np.broadcast_to(_spread(argument, axis_names(axes)), (len(argument), nodes, lanes)).reshape(
+                len(argument), -1
+            )
+            for argument, axes in zip(arguments, self.grid.arguments, strict=True)
+        ]
+        found = _map(self._function, everywhere, nodes * lanes, self.tape.outputs)
+        for result, values, axes in zip(out, found, self.grid.results, strict=True):
+            grid = values.reshape(-1, nodes, lanes)
+            result[...] = grid if axes == "point" else result + grid.sum(axis=1)
+
+
+def _spread(array: Array, names: tuple[str, ...]) -> Array:
+    """Insert the axes that an argument does not vary over."""
+    sizes = dict(zip(names, array.shape[1:], strict=True))
+    return array.reshape(len(array), sizes.get("nodes", 1), sizes.get("lanes", 1))
+
+
+def _map(function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]) -> list[Array]:
+    if n == 0:
+        return [np.empty((width, 0)) for width in widths]
+    results = function.map(n)(*arguments)
+    results = results if isinstance(results, tuple) else (results,)
+    return [np.ascontiguousarray(np.array(result)) for result in results]

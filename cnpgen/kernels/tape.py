@@ -1,9 +1,9 @@
-"""A tape: an SX function as a flat list of scalar operations, and the description of the loop that runs it."""
+"""A tape: an SX function as a flat list of scalar operations, and the description of the loop or grid that runs it."""
 
 import hashlib
 import io
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,29 @@ class Loop:
     limit: int
 
 
+Axes = Literal["point", "lane", "node", "fixed"]
+AXES: tuple[Axes, ...] = ("point", "lane", "node", "fixed")
+Dtype = Literal["float64", "float32"]
+DTYPES: tuple[Dtype, ...] = ("float64", "float32")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Evaluate the tape at K nodes of every lane, and keep results per point or sum them over the nodes of a lane.
+
+    Attributes:
+        arguments: What each argument varies over: "point" (nodes and lanes), "lane", "node" or "fixed" (neither). What
+            is the same in all lanes ("node", "fixed") must not be nan.
+        results: "point" or "lane" per result; "lane" is the sum over the nodes.
+    """
+
+    arguments: tuple[Axes, ...]
+    results: tuple[Axes, ...]
+
+
 @dataclass(frozen=True)
 class Tape:
-    """A straight-line program on float64 scalars.
+    """A straight-line program on scalars.
 
     Instruction k computes value k. ``INPUT`` has a = argument, b = component; ``OUTPUT`` has a = value, b = argument
     and ``constant`` = component; every other operation has a, b = operand values.
@@ -51,6 +71,8 @@ class Tape:
         b: Second operands, shape (K,), int32.
         constant: Constants, shape (K,), float64.
         loop: How to iterate, or None to evaluate once.
+        grid: The points to evaluate it at, or None for one point per lane.
+        dtype: What it computes with.
     """
 
     name: str
@@ -61,6 +83,8 @@ class Tape:
     b: NDArray[np.int32]
     constant: NDArray[np.float64]
     loop: Loop | None = None
+    grid: Grid | None = None
+    dtype: Dtype = "float64"
 
     def __len__(self) -> int:
         return len(self.operation)
@@ -69,11 +93,14 @@ class Tape:
         """Serialize, with a checksum; equal tapes give equal bytes."""
         buffer = io.BytesIO()
         loop = [self.loop.tolerance, float(self.loop.limit)] if self.loop else []
+        axes = (self.grid.arguments, self.grid.results) if self.grid else ((), ())
         header = [
             np.frombuffer(self.name.encode(), np.uint8),
             np.array(self.inputs),
             np.array(self.outputs),
             np.array(loop),
+            *(np.array([AXES.index(name) for name in names], np.int8) for names in axes),
+            np.array(DTYPES.index(self.dtype)),
         ]
         for array in (*header, self.operation, self.a, self.b, self.constant):
             np.save(buffer, array, allow_pickle=False)
@@ -91,22 +118,39 @@ class Tape:
         if hashlib.sha256(content).digest() != checksum:
             raise ValueError("damaged tape: its checksum is wrong")
         buffer = io.BytesIO(content)
-        name, inputs, outputs, loop, *program = (np.load(buffer, allow_pickle=False) for _ in range(8))
+        name, inputs, outputs, loop, arguments, results, dtype, *program = (
+            np.load(buffer, allow_pickle=False) for _ in range(11)
+        )
         iteration = Loop(float(loop[0]), int(loop[1])) if len(loop) else None
+        grid = Grid(tuple(AXES[i] for i in arguments), tuple(AXES[i] for i in results)) if len(arguments) else None
         operation, a, b, constant = program
-        widths = tuple(inputs.tolist()), tuple(outputs.tolist())
-        return cls(bytes(name).decode(), *widths, operation, a, b, constant, iteration)
+        return cls(
+            bytes(name).decode(),
+            tuple(inputs.tolist()),
+            tuple(outputs.tolist()),
+            operation,
+            a,
+            b,
+            constant,
+            loop=iteration,
+            grid=grid,
+            dtype=DTYPES[int(dtype)],
+        )
 
 
-def tape_from_function(function: Any, loop: Loop | None = None) -> Tape:
+def tape_from_function(
+    function: Any, loop: Loop | None = None, *, grid: Grid | None = None, dtype: Dtype = "float64"
+) -> Tape:
     """Flatten a CasADi SX function.
 
     Args:
         function: A ``casadi.Function`` of SX expressions; arguments and results are columns.
         loop: How to iterate it, or None.
+        grid: The points to evaluate it at, or None for one point per lane.
+        dtype: What it computes with.
 
     Raises:
-        ValueError: It uses an operation that tapes do not have.
+        ValueError: It uses an operation that tapes do not have, or the grid does not fit it.
     """
     import casadi as ca
 
@@ -135,7 +179,8 @@ def tape_from_function(function: Any, loop: Loop | None = None) -> Tape:
     widths_in = tuple(function.nnz_in(i) for i in range(function.n_in()))
     widths_out = tuple(function.nnz_out(i) for i in range(function.n_out()))
     _check_dense(function)
-    return Tape(function.name(), widths_in, widths_out, operation, a, b, constant, loop)
+    _check_grid(function, grid)
+    return Tape(function.name(), widths_in, widths_out, operation, a, b, constant, loop=loop, grid=grid, dtype=dtype)
 
 
 def _check_dense(function: Any) -> None:
@@ -147,3 +192,16 @@ def _check_dense(function: Any) -> None:
         for index in range(count):
             if nnz(index) != numel(index):
                 raise ValueError(f"{function.name()}: {what} {index} is sparse; densify it")
+
+
+def _check_grid(function: Any, grid: Grid | None) -> None:
+    """Raise for a grid that is not about this function."""
+    if grid is None:
+        return
+    if (len(grid.arguments), len(grid.results)) != (function.n_in(), function.n_out()):
+        raise ValueError(
+            f"{function.name()}: the grid must name {function.n_in()} arguments and {function.n_out()} results,"
+            f" got {len(grid.arguments)} and {len(grid.results)}"
+        )
+    if not {"point", "lane"} >= set(grid.results):
+        raise ValueError(f"{function.name()}: results of a grid are per point or per lane, got {grid.results}")

@@ -1,11 +1,14 @@
 """Exact distances between the robot's capsules, an upright cuboid and axis-aligned boxes, as SX."""
 
+from collections.abc import Callable
 from typing import Any
 
 from cnpgen.robots.linalg import Scalar, dot
 from cnpgen.robots.symbolic import Vec
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
+ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one is needed
+POINT = 1e-12  # m^2: keeps a distance of nothing, and a segment of no extent along an axis, differentiable
 
 
 def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
@@ -23,6 +26,55 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
     import casadi as ca
 
     along = [b - a for a, b in zip(first, second, strict=True)]
+    t = _nearest(first, along, box)
+    outside = [_outside(first[axis] + t * along[axis], box[axis]) for axis in range(3)]
+    return ca.sqrt(sum(x * x for x in outside))
+
+
+def signed_segment_box_distance(first: Vec, second: Vec, box: Bounds, *, hold: Callable[[Scalar], Scalar]) -> Scalar:
+    """Distance from a segment to an axis-aligned box, negative where it is inside [m]: it has a gradient everywhere.
+
+    Inside it is the depth, below the nearest face, of the middle of the part that is inside. Outside, the nearest point
+    of the segment may be held while the distance is differentiated: it minimises the distance, so that to first order
+    its own motion changes nothing.
+
+    Args:
+        first: One end [m].
+        second: Other end [m].
+        box: Bounds along x, y, z [m].
+        hold: Returns a value as a constant for differentiation.
+    """
+    import casadi as ca
+
+    along = [b - a for a, b in zip(first, second, strict=True)]
+    t = hold(_nearest(first, along, box))
+    outside = [_outside(first[axis] + t * along[axis], box[axis]) for axis in range(3)]
+    middle = _middle(first, along, box)
+    depth: Scalar = -ENDLESS
+    for axis, (low, high) in enumerate(box):
+        x = first[axis] + middle * along[axis]
+        for gap in ([] if low is None else [low - x]) + ([] if high is None else [x - high]):
+            depth = ca.fmax(gap, depth)
+    return ca.sqrt(sum(x * x for x in outside) + POINT) + ca.fmin(depth, 0)
+
+
+def _middle(first: Vec, along: Vec, box: Bounds) -> Scalar:
+    """Where on a segment the middle of its part inside a box is, in [0, 1]; anywhere on it if it is outside."""
+    import casadi as ca
+
+    enter, leave = ca.SX(0), ca.SX(1)
+    for axis, (low, high) in enumerate(box):
+        per_length = along[axis] / (along[axis] * along[axis] + POINT)
+        bounds = [high - ENDLESS if low is None else low, low + ENDLESS if high is None else high]
+        faces = [(face - first[axis]) * per_length for face in bounds]
+        enter, leave = ca.fmax(enter, ca.fmin(*faces)), ca.fmin(leave, ca.fmax(*faces))
+    return ca.fmax(ca.fmin(0.5 * (enter + leave), 1), 0)
+
+
+def _nearest(first: Vec, along: Vec, box: Bounds) -> Scalar:
+    """Where on a segment its point nearest to a box is, in [0, 1]."""
+    import casadi as ca
+
     knots = [
         ca.fmin(ca.fmax((face - first[axis]) / along[axis], 0), 1)
         for axis in range(3)
@@ -30,18 +82,13 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
         if face is not None
     ]
     low, high = ca.SX(0), ca.SX(1)
-    slope_low, slope_high = _slope(first, along, box, ca.SX(0)), _slope(first, along, box, ca.SX(1))
-    start, end = slope_low, slope_high
     for knot in knots:
         slope = _slope(first, along, box, knot)
-        falls = ca.logic_and(slope <= 0, low < knot)
-        low, slope_low = ca.if_else(falls, knot, low), ca.if_else(falls, slope, slope_low)
-        rises = ca.logic_and(slope >= 0, knot < high)
-        high, slope_high = ca.if_else(rises, knot, high), ca.if_else(rises, slope, slope_high)
-    fraction = ca.fmax(ca.fmin(-slope_low / ca.fmax(slope_high - slope_low, 1e-300), 1), 0)
-    t = ca.if_else(start >= 0, 0, ca.if_else(end <= 0, 1, low + fraction * (high - low)))
-    outside = [_outside(first[axis] + t * along[axis], box[axis]) for axis in range(3)]
-    return ca.sqrt(sum(x * x for x in outside))
+        low = ca.fmax(low, ca.if_else(slope <= 0, knot, 0))
+        high = ca.fmin(high, 1 - ca.if_else(slope >= 0, 1 - knot, 0))
+    slope_low, slope_high = _slope(first, along, box, low), _slope(first, along, box, high)
+    fraction = ca.fmax(ca.fmin(-slope_low / ca.fmax(slope_high - slope_low, 1e-30), 1), 0)  # a number of float32, too
+    return low + fraction * (high - low)
 
 
 def _outside(x: Scalar, bounds: tuple[Any, Any]) -> Scalar:
@@ -49,8 +96,8 @@ def _outside(x: Scalar, bounds: tuple[Any, Any]) -> Scalar:
     import casadi as ca
 
     low, high = bounds
-    beyond = ca.fmax(x - high, 0) if high is not None else ca.SX(0)
-    return beyond - ca.fmax(low - x, 0) if low is not None else beyond
+    inside = x if low is None else ca.fmax(x, low)
+    return x - (inside if high is None else ca.fmin(inside, high))
 
 
 def _slope(first: Vec, along: Vec, box: Bounds, t: Scalar) -> Scalar:

@@ -92,8 +92,27 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
     return bias
 
 
-def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
-    """Joint torques [N m] by recursive Newton-Euler, in joint frames.
+@dataclass(frozen=True)
+class BodyMotion:
+    """How the body of a joint moves, in its joint's frame.
+
+    Attributes:
+        rotation: From the joint's frame to the previous one, 3 rows of 3.
+        offset: Origin of the joint's frame in the previous one [m].
+        omega: Angular velocity [rad/s].
+        alpha: Angular acceleration [rad/s^2].
+        acceleration: Acceleration of the origin less gravity [m/s^2].
+    """
+
+    rotation: list[Vec]
+    offset: Vec
+    omega: Vec
+    alpha: Vec
+    acceleration: Vec
+
+
+def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
+    """Motion of every body, the outward recursion of Newton-Euler.
 
     Args:
         chain: The chain.
@@ -104,11 +123,11 @@ def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
     omega: Vec = [0.0, 0.0, 0.0]
     alpha: Vec = [0.0, 0.0, 0.0]
     acceleration: Vec = _constants(-chain.gravity)
-    rotations, offsets, forces, moments = [], [], [], []
+    motions = []
     for joint, angle, rate, rate2 in zip(chain.joints, q, dq, ddq, strict=True):
         rotation = _product(_rows(joint.rotation), _turn(joint, angle))
         offset = _offset(joint, angle)
-        acceleration = add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
+        acceleration = carried(acceleration, omega, alpha, offset)
         acceleration, omega, alpha = (_transposed_times(rotation, x) for x in (acceleration, omega, alpha))
         axis = _constants(joint.axis)
         if joint.prismatic:
@@ -117,37 +136,43 @@ def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
         else:
             alpha = add(alpha, add(cross(omega, scale(axis, rate)), scale(axis, rate2)))
             omega = add(omega, scale(axis, rate))
-        force, moment = _body_wrench(joint, omega, alpha, acceleration)
-        rotations.append(rotation)
-        offsets.append(offset)
-        forces.append(force)
-        moments.append(moment)
-    return _propagate(chain, rotations, offsets, forces, moments)
+        motions.append(BodyMotion(rotation, offset, omega, alpha, acceleration))
+    return motions
 
 
-def _body_wrench(joint: Joint, omega: Vec, alpha: Vec, acceleration: Vec) -> tuple[Vec, Vec]:
-    """Force and moment about the joint origin that the body of a joint needs for its motion."""
-    com, inertia = _constants(joint.com), _rows(joint.inertia)
-    at_com = add(acceleration, add(cross(alpha, com), cross(omega, cross(omega, com))))
-    force = scale(at_com, joint.mass)
-    spin = add(_times(inertia, alpha), cross(omega, _times(inertia, omega)))
-    return force, add(spin, cross(com, force))
+def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
+    """Joint torques [N m] by recursive Newton-Euler, in joint frames.
 
-
-def _propagate(
-    chain: Chain, rotations: list[list[Vec]], offsets: list[Vec], forces: list[Vec], moments: list[Vec]
-) -> Vec:
-    """Sum wrenches from the tip to the base and project them on the joint axes."""
+    Args:
+        chain: The chain.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+    """
+    motions = body_motions(chain, q, dq, ddq)
+    wrenches = [_body_wrench(joint, motion) for joint, motion in zip(chain.joints, motions, strict=True)]
     force: Vec = [0.0, 0.0, 0.0]
     moment: Vec = [0.0, 0.0, 0.0]
     torques: Vec = []
-    for index in reversed(range(len(chain.joints))):
-        joint = chain.joints[index]
-        force, moment = add(force, forces[index]), add(moment, moments[index])
+    for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
+        force, moment = add(force, wrench[0]), add(moment, wrench[1])
         torques.append(dot(_constants(joint.axis), force if joint.prismatic else moment))
-        force = _times(rotations[index], force)
-        moment = add(_times(rotations[index], moment), cross(offsets[index], force))
+        force = _times(motion.rotation, force)
+        moment = add(_times(motion.rotation, moment), cross(motion.offset, force))
     return torques[::-1]
+
+
+def carried(acceleration: Vec, omega: Vec, alpha: Vec, offset: Vec) -> Vec:
+    """Acceleration of a point of a body at ``offset`` from the one that has ``acceleration``."""
+    return add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
+
+
+def _body_wrench(joint: Joint, motion: BodyMotion) -> tuple[Vec, Vec]:
+    """Force and moment about the joint origin that the body of a joint needs for its motion."""
+    com, inertia, omega = _constants(joint.com), _rows(joint.inertia), motion.omega
+    force = scale(carried(motion.acceleration, omega, motion.alpha, com), joint.mass)
+    spin = add(_times(inertia, motion.alpha), cross(omega, _times(inertia, omega)))
+    return force, add(spin, cross(com, force))
 
 
 @dataclass(frozen=True)
@@ -205,6 +230,10 @@ class SymbolicState:
             [(box.x.low, box.x.high), (box.y.low, box.y.high), (None if box.height is None else top - box.height, top)]
             for box, top in zip(self.obstacles, self.tops, strict=True)
         ]
+
+    def hold(self, value: Scalar) -> Scalar:
+        """Return a value that the derivative of what it is used in may take as a constant; here nothing is held."""
+        return value
 
 
 def symbols(name: str, width: int) -> tuple[Any, Vec]:

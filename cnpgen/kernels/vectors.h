@@ -1,0 +1,168 @@
+/* What every compiled kernel begins with: vectors of double, or of float where SINGLE is defined, one lane per sample, and
+functions of them.
+
+Comparisons are 1 or 0, as in CasADi; minima and maxima ignore a nan, as C's fmin and CasADi's do (the instructions, here
+lesser and larger, return their second operand if either is nan). Sine and cosine reduce their argument by pi/2 in three
+parts (Cody and Waite; of 33, 33 and 53 bits as in fdlibm, or of 8, 11 and 24 bits), the exponential by ln 2 in two; the
+polynomials are those of the Cephes mathematical library. Errors are at most 2 ulp: of the exponential everywhere, of sine
+and cosine for |x| up to 2^20 (float: up to 2^8; to 2^13 they are right to 2e-7, but not to 2 ulp beside their zeros). */
+
+#include <math.h>
+#include <string.h>
+
+#ifdef SINGLE
+typedef float real;
+typedef int integer;
+#define HIGHEST 0x7fffffff
+#define MAGIC 12582912.0f /* 1.5 * 2^23: x + MAGIC has the nearest integer in its last bits */
+#define TWO_OVER_PI 0.636619772f
+#define PI_2_HIGH 1.5703125f
+#define PI_2_MIDDLE 4.837512969970703125e-4f
+#define PI_2_LOW 7.54978995489188216e-8f
+#define LOG2E 1.44269504f
+#define LN2_HIGH 0.693359375f
+#define LN2_LOW (-2.12194440e-4f)
+#define EXTREME 110.0f /* exp(-x) is 0 and exp(x) infinite */
+#define BIAS 127
+#define MANTISSA 23
+#else
+typedef double real;
+typedef long long integer;
+#define HIGHEST 0x7fffffffffffffffLL
+#define MAGIC 6755399441055744.0
+#define TWO_OVER_PI 0.63661977236758134308
+#define PI_2_HIGH 1.57079632673412561417
+#define PI_2_MIDDLE 6.07710050630396597660e-11
+#define PI_2_LOW 2.02226624879595063154e-21
+#define LOG2E 1.4426950408889634073599
+#define LN2_HIGH 6.93145751953125e-1
+#define LN2_LOW 1.42860682030941723212e-6
+#define EXTREME 800.0
+#define BIAS 1023
+#define MANTISSA 52
+#endif
+
+#if defined(__AVX512F__)
+#include <immintrin.h>
+#define BYTES 64
+#ifdef SINGLE
+#define WIDE(name, ...) (v)_mm512_##name##_ps(__VA_ARGS__)
+typedef __m512 wide;
+#else
+#define WIDE(name, ...) (v)_mm512_##name##_pd(__VA_ARGS__)
+typedef __m512d wide;
+#endif
+#elif defined(__AVX__)
+#include <immintrin.h>
+#define BYTES 32
+#ifdef SINGLE
+#define WIDE(name, ...) (v)_mm256_##name##_ps(__VA_ARGS__)
+typedef __m256 wide;
+#else
+#define WIDE(name, ...) (v)_mm256_##name##_pd(__VA_ARGS__)
+typedef __m256d wide;
+#endif
+#else
+#define BYTES 16
+#if defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+#endif
+
+#define W ((int)(BYTES / sizeof(real)))
+typedef real v __attribute__((vector_size(BYTES)));
+typedef real vu __attribute__((vector_size(BYTES), aligned(sizeof(real))));
+typedef integer vi __attribute__((vector_size(BYTES)));
+
+#define I static inline __attribute__((always_inline))
+I v K(real x) { v y = {0}; return y + x; }
+I v pick(vi m, v a, v b) { return (v)((m & (vi)a) | (~m & (vi)b)); }
+I v vabs(v x) { return (v)((vi)x & HIGHEST); }
+
+#ifdef WIDE
+I v vsqrt(v x) { return WIDE(sqrt, (wide)x); }
+I v lesser(v a, v b) { return WIDE(min, (wide)a, (wide)b); }
+I v larger(v a, v b) { return WIDE(max, (wide)a, (wide)b); }
+#else
+#if defined(__aarch64__) && defined(SINGLE)
+I v vsqrt(v x) { return (v)vsqrtq_f32((float32x4_t)x); }
+#elif defined(__aarch64__)
+I v vsqrt(v x) { return (v)vsqrtq_f64((float64x2_t)x); }
+#else
+I v vsqrt(v x) { for (int i = 0; i < W; i++) x[i] = sqrt(x[i]); return x; }
+#endif
+I v lesser(v a, v b) { return pick(a < b, a, b); }
+I v larger(v a, v b) { return pick(a > b, a, b); }
+#endif
+
+I v vmin(v a, v b) { return pick(b != b, a, lesser(a, b)); }
+I v vmax(v a, v b) { return pick(b != b, a, larger(a, b)); }
+I v flag(vi m) { return (v)(m & (vi)K(1)); }
+I v vlt(v a, v b) { return flag(a < b); }
+I v vle(v a, v b) { return flag(a <= b); }
+I v veq(v a, v b) { return flag(a == b); }
+I v vne(v a, v b) { return flag(a != b); }
+I v vnot(v a) { return flag(a == K(0)); }
+I v vand(v a, v b) { return flag((a != K(0)) & (b != K(0))); }
+I v vor(v a, v b) { return flag((a != K(0)) | (b != K(0))); }
+I v vsel(v c, v b) { return (v)((c != K(0)) & (vi)b); }
+I v vsign(v a) { return pick(a != a, a, vlt(K(0), a) - vlt(a, K(0))); }
+
+#ifdef SINGLE
+I v reduced_sin(v r, v z) {
+  return (((-1.9515295891e-4f * z + 8.3321608736e-3f) * z - 1.6666654611e-1f) * z) * r + r;
+}
+I v reduced_cos(v z) {
+  return (((2.443315711809948e-5f * z - 1.388731625493765e-3f) * z + 4.166664568298827e-2f) * z) * z - 0.5f * z + 1.0f;
+}
+I v reduced_exp(v r) {
+  return (((((1.9875691500e-4f * r + 1.3981999507e-3f) * r + 8.3334519073e-3f) * r + 4.1665795894e-2f) * r
+    + 1.6666665459e-1f) * r + 5.0000001201e-1f) * (r * r) + r + 1.0f;
+}
+#else
+I v reduced_sin(v r, v z) {
+  return ((((((1.58962301576546568060e-10*z-2.50507477628578072866e-8)*z+2.75573136213857245213e-6)*z
+    -1.98412698295895385996e-4)*z+8.33333333332211858878e-3)*z-1.66666666666666307295e-1)*z)*r+r;
+}
+I v reduced_cos(v z) {
+  return (((((((-1.13585365213876817300e-11*z+2.08757008419747316778e-9)*z-2.75573141792967388112e-7)*z
+    +2.48015872888517045348e-5)*z-1.38888888888730564116e-3)*z+4.16666666666665929218e-2)*z)*z-0.5*z)+1.0;
+}
+I v reduced_exp(v r) {
+  v z = r * r, p = r * ((1.26177193074810590878e-4 * z + 3.02994407707441961300e-2) * z + 9.99999999999999999910e-1);
+  v q = ((3.00198505138664455042e-6 * z + 2.52448340349684104192e-3) * z + 2.27265548208155028766e-1) * z + 2.0;
+  return 1.0 + 2.0 * (p / (q - p));
+}
+#endif
+
+I v power_of_two(vi n) { return (v)((n + BIAS) << MANTISSA); }
+I v vexp(v x) {
+  v clipped = larger(lesser(x, K(EXTREME)), K(-EXTREME)), n = clipped * K(LOG2E) + K(MAGIC);
+  vi whole = (vi)n - (vi)K(MAGIC), half = whole >> 1;
+  n -= K(MAGIC);
+  v y = reduced_exp((clipped - n * K(LN2_HIGH)) - n * K(LN2_LOW));
+  return pick(x != x, x, y * power_of_two(half) * power_of_two(whole - half));
+}
+I void vsincos(v x, v *s, v *c) {
+  v n = x * K(TWO_OVER_PI) + K(MAGIC);
+  vi quadrant = (vi)n;
+  n -= K(MAGIC);
+  v r = ((x - n * K(PI_2_HIGH)) - n * K(PI_2_MIDDLE)) - n * K(PI_2_LOW), z = r * r;
+  v sine = reduced_sin(r, z), cosine = reduced_cos(z);
+  vi odd = -(quadrant & 1);
+  v a = pick(odd, cosine, sine), b = pick(odd, sine, cosine);
+  int sign = 8 * (int)sizeof(real) - 2;
+  *s = (v)((vi)a ^ ((quadrant & 2) << sign));
+  *c = (v)((vi)b ^ (((quadrant + 1) & 2) << sign));
+}
+
+I v load(const real *p, long k, long n) {
+  if (k + W <= n) return *(const vu *)(p + k);
+  v x;
+  for (int i = 0; i < W; i++) x[i] = p[k + i < n ? k + i : n - 1];
+  return x;
+}
+I void store(real *p, long k, long n, v x) {
+  if (k + W <= n) { *(vu *)(p + k) = x; return; }
+  for (int i = 0; k + i < n; i++) p[k + i] = x[i];
+}

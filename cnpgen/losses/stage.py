@@ -1,0 +1,145 @@
+"""What is integrated: the step losses of one phase of one plan and their gradient, as SX.
+
+Terms are the task loss and one per constraint of the problem, all times ``dt/ds = 1 / r`` (paper, section on loss
+functions) and the quadrature weight of the node.
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.constraints.constraint import Condition, Constraint
+from cnpgen.kernels.tape import Axes, Grid
+from cnpgen.losses.published import published
+from cnpgen.losses.terms import Term, constraint_term, task_term
+from cnpgen.recipes import Problem
+from cnpgen.robots.symbolic import SymbolicState
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+ARGUMENTS: tuple[Axes, ...] = ("point", "point", "point", "point", "lane", "point", "node", "fixed", "fixed")
+VALUES = Grid(ARGUMENTS, ("lane",))
+GRADIENT = Grid(ARGUMENTS, ("lane", "point", "point", "point", "point"))
+
+
+@dataclass(frozen=True)
+class HeldState(SymbolicState):
+    """A state whose held values are symbols until the derivatives are built.
+
+    Attributes:
+        held: Pairs of a symbol and the value that it stands for.
+    """
+
+    held: list[tuple[Any, Any]] = field(default_factory=list)
+
+    def hold(self, value: Any) -> Any:
+        """Return a symbol for a value, so that derivatives pass it by."""
+        import casadi as ca
+
+        symbol = ca.SX.sym(f"held_{len(self.held)}")
+        self.held.append((symbol, value))
+        return symbol
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The arguments of the kernels as SX columns, in order; ``ARGUMENTS`` says what they vary over.
+
+    Attributes:
+        p: Path [rad], n.
+        dp: p' [rad].
+        ddp: p'' [rad].
+        rate: r and r' [1/s].
+        tops: Heights of the obstacles [m].
+        wider: How much wider than their bounds the conditions of constraints with a funnel are, in their units.
+        node: The quadrature weight.
+        tightening: For every constraint the factor of its limits, then for every one the inset of its other bounds.
+        weights: The weight of every constraint (the paper's e^alpha).
+    """
+
+    p: Any
+    dp: Any
+    ddp: Any
+    rate: Any
+    tops: Any
+    wider: Any
+    node: Any
+    tightening: Any
+    weights: Any
+
+    @property
+    def columns(self) -> list[Any]:
+        """All of them."""
+        return [*vars(self).values()]
+
+
+def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
+    """Build ``inputs -> terms``: what is summed over the nodes, without weights."""
+    import casadi as ca
+
+    inputs, state, terms = _stage(robot, problem, form)
+    return ca.Function("loss_values", inputs.columns, ca.cse(_released(state, [_stacked(inputs, terms)])))
+
+
+def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
+    """Build ``inputs -> (terms, d/dp, d/dp', d/dp'', d/d(r, r'))`` of the weighted sum, by the reverse mode."""
+    import casadi as ca
+
+    inputs, state, terms = _stage(robot, problem, form)
+    n, step, weights = robot.n, inputs.node / inputs.rate[0], [1.0, *ca.vertsplit(inputs.weights)]
+    g = [part for term in terms for part, _ in term.parts]
+    seeds = [step * weight * slope for weight, term in zip(weights, terms, strict=True) for _, slope in term.parts]
+    states = ca.vertcat(inputs.p, inputs.dp, inputs.ddp, inputs.rate)
+    back = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
+    total = sum(weight * term.value for weight, term in zip(weights, terms, strict=True))
+    back[3 * n] -= step / inputs.rate[0] * total  # the factor 1 / r
+    parts = [back[first : first + n] for first in (0, n, 2 * n)]
+    results = _released(state, [_stacked(inputs, terms), *parts, back[3 * n :]])
+    return ca.Function("loss_gradient", inputs.columns, ca.cse(results))
+
+
+def stated(problem: Problem, state: SymbolicState, form: str) -> list[tuple[Constraint, tuple[Condition, ...]]]:
+    """State what is penalised, constraint by constraint."""
+    return [(each, published(each, state) if form == "paper" else each.penalised(state)) for each in problem.constraint]
+
+
+def has_funnel(constraint: Constraint) -> bool:
+    """Whether motions may begin outside of a constraint."""
+    return type(constraint).funnel is not Constraint.funnel
+
+
+def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldState, list[Term]]:
+    """Return the inputs, the state at them, and the terms: task and constraints."""
+    import casadi as ca
+
+    sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
+    p, dp, ddp, rate = sym("p", n), sym("dp", n), sym("ddp", n), sym("rate", 2)
+    dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
+    tops, size = sym("tops", len(problem.obstacle)), problem.object.size if problem.object is not None else None
+    q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
+    state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size)
+    pairs = stated(problem, state, form)
+    count = sum(len(condition.g) for each, conditions in pairs if has_funnel(each) for condition in conditions)
+    wider, tightening = sym("wider", count), sym("tightening", 2 * m)
+    inputs = Inputs(p, dp, ddp, rate, tops, wider, sym("node"), tightening, sym("weights", m))
+    free = iter(ca.vertsplit(wider))
+    terms = [task_term(state, problem.objective.centrifugal)]
+    for index, (each, conditions) in enumerate(pairs):
+        funnel = [next(free) if has_funnel(each) else None for condition in conditions for _ in condition.g]
+        terms.append(constraint_term(conditions, tightening[index], tightening[m + index], funnel))
+    return inputs, state, terms
+
+
+def _stacked(inputs: Inputs, terms: list[Term]) -> Any:
+    import casadi as ca
+
+    return ca.vertcat(*[inputs.node / inputs.rate[0] * term.value for term in terms])
+
+
+def _released(state: HeldState, results: list[Any]) -> list[Any]:
+    """Put held values back in place of their symbols."""
+    import casadi as ca
+
+    symbols, values = [symbol for symbol, _ in state.held], [value for _, value in state.held]
+    released: list[Any] = ca.substitute(results, symbols, values) if symbols else results
+    return released
