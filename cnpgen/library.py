@@ -28,7 +28,11 @@ _LAYOUT: dict[Kind, str] = {
     "pipeline": "pipelines/*.toml",
     "dataset": "datasets/*.toml",
 }
-_MARKS: dict[Kind, set[str]] = {"problem": {"robot"}, "pipeline": {"stage"}, "dataset": {"splits", "pipeline"}}
+_MARKS: dict[Kind, set[str]] = {
+    "problem": {"robot", "constraint", "limits"},
+    "pipeline": {"stage", "problem"},
+    "dataset": {"splits", "pipeline"},
+}
 
 
 def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
@@ -121,6 +125,15 @@ def list_recipes(kind: Kind) -> dict[str, Path]:
     folder, _, pattern = _LAYOUT[kind].partition("/")
     files = sorted((recipes_root() / folder).glob(pattern))
     return {file.parent.name if kind == "problem" else file.stem: file for file in files}
+
+
+def kind_of_file(path: Path) -> Kind:
+    """Tell the kind of a recipe file by its keys; "dataset" where they do not tell or it cannot be read."""
+    try:
+        table = _toml(path.read_bytes())
+    except (OSError, ValueError):
+        return "dataset"
+    return next((kind for kind in _MARKS if _is(kind, table)), "dataset")
 
 
 def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | None = None) -> Path:

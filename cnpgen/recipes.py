@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen import plugins
+from cnpgen.constraints.clearance import ObjectContact
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.stage import Stage
@@ -105,7 +106,10 @@ class Objective:
     """What a good motion is: the integral over time of ``1 + centrifugal |kappa| v^2`` (paper, Appendix B, eta)."""
 
     centrifugal: float = field(
-        "weight of the centrifugal acceleration |kappa| v^2 of the tip beside the time", unit="s^2/m", default=0.0, low=0.0
+        "weight of the centrifugal acceleration |kappa| v^2 of the tip beside the time",
+        unit="s^2/m",
+        default=0.0,
+        low=0.0,
     )
 
 
@@ -129,6 +133,16 @@ class Problem:
     objective: Objective = field("what a good motion is", default=Objective())
     path: Path = Path()
     digest: str = ""
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        depth = max((item.depth for item in self.constraint if isinstance(item, ObjectContact)), default=0.0)
+        if self.object is not None and min(self.object.size) <= 2 * depth:
+            yield (
+                "object",
+                f"is {min(self.object.size):g} m thin, where contacts {depth:g} m deep are legal (object-contact):"
+                " expected more than twice the depth",
+            )
 
     @property
     def urdf_path(self) -> Path:

@@ -107,14 +107,17 @@ def keys(cls: type) -> tuple[Key, ...]:
 
 @dataclass(frozen=True)
 class Place:
-    """Where in which file something is: ``place / "robot" / "base"``, ``place / "stage" / 3``."""
+    """Where in which file something is: ``place / "robot" / "base"``, ``place / "stage" / 3``.
+
+    Entries of a list are shown as people count them: the first stage is "stage 1".
+    """
 
     file: str
     key: str = ""
 
     def __truediv__(self, key: str | int) -> "Place":
         if isinstance(key, int):
-            return Place(self.file, f"{self.key}[{key}]")
+            return Place(self.file, f"{self.key} {key + 1}")
         bare = key if re.fullmatch(r"[\w-]+", key) else json.dumps(key)
         return Place(self.file, f"{self.key}.{bare}" if self.key else bare)
 

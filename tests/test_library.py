@@ -178,8 +178,8 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
         f"{files['dataset']}: sed: unknown key (did you mean 'seed'?)",
         f"{problem}: robot.tip: expected a string, got 3",
         f"{problem}: limits.velocity_scale: 1.5 is too large, expected at most 1",
-        f"{pipeline}: stage[0].siz: unknown key (did you mean 'size'?)",
-        f"{pipeline}: stage[0].size: missing key, expected a range, each end a length [m]: size of the die",
+        f"{pipeline}: stage 1.siz: unknown key (did you mean 'size'?)",
+        f"{pipeline}: stage 1.size: missing key, expected a range, each end a length [m]: size of the die",
         f"{files['dataset']}: splits.train: 0 is too small, expected at least 1",
     )
 
@@ -192,19 +192,19 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
         ('urdf = "arm.urdf"', 'urdf = "ram.urdf"', "robot.urdf: no such file: "),
         ('base = "[0, 90] deg"', "base = [0]", "robot.base: expected 2 numbers, one per planned joint, got 1"),
         ('joints = ["a", "b"]', 'joints = ["a", "a"]', "robot.joints: each joint can be planned once, got a"),
-        ('use = "still"', 'use = "level"', "constraint[1].use: there is a constraint 'level' already"),
-        ('use = "still"', 'use = "stil"', "constraint[1].use: unknown constraint 'stil' (did you mean 'still'?)"),
-        ('use = "still"\n', "", "constraint[1].use: missing key, expected one of level, still"),
-        ('below = "start"', 'below = "start"\ntop = 1.0', "obstacle[0].top: obstacle 'pedestal' has both"),
-        ('below = "start"', "", "obstacle[0].top: obstacle 'pedestal' has no height"),
-        ('below = "start"', 'below = "stat"', "obstacle[0].below: expected one of '', 'start', 'goal', got 'stat'"),
-        ('[object]\nsize = "[10, 10, 20] cm"', "", "obstacle[0].below: nothing stands on the obstacle"),
+        ('use = "still"', 'use = "level"', "constraint 2.use: there is a constraint 'level' already"),
+        ('use = "still"', 'use = "stil"', "constraint 2.use: unknown constraint 'stil' (did you mean 'still'?)"),
+        ('use = "still"\n', "", "constraint 2.use: missing key, expected one of level, still"),
+        ('below = "start"', 'below = "start"\ntop = 1.0', "obstacle 1.top: obstacle 'pedestal' has both"),
+        ('below = "start"', "", "obstacle 1.top: obstacle 'pedestal' has no height"),
+        ('below = "start"', 'below = "stat"', "obstacle 1.below: expected one of '', 'start', 'goal', got 'stat'"),
+        ('[object]\nsize = "[10, 10, 20] cm"', "", "obstacle 1.below: nothing stands on the obstacle"),
         (
             'below = "start"',
             'below = "goal"\n' + PROBLEM[PROBLEM.index("[[obst") : PROBLEM.index("[[const")],
-            "obstacle[1].name",
+            "obstacle 2.name",
         ),
-        ('x = "[0, 1] m"', 'x = "[1, 0] m"', "obstacle[0].x: empty range"),
+        ('x = "[0, 1] m"', 'x = "[1, 0] m"', "obstacle 1.x: empty range"),
     ],
 )
 def test_a_mistake_in_a_problem_is_reported_with_its_key(files, old, new, mistake):
@@ -220,7 +220,7 @@ def test_semantic_mistakes_are_reported_along_with_wrong_types(files):
     edit(files["problem"], 'use = "still"', 'use = "level"')
     mistakes = mistakes_of(load_problem, files["problem"])
     keys = [mistake.split(":")[0] for mistake in mistakes]
-    assert keys == ["limits.velocity_scale", "robot.urdf", "constraint[1].use"]
+    assert keys == ["limits.velocity_scale", "robot.urdf", "constraint 2.use"]
     assert mistakes[1].endswith("(did you mean 'arm.urdf'?)")
 
 
@@ -254,7 +254,8 @@ def test_a_mistake_in_a_dataset_is_reported_with_its_key(files, old, new, mistak
 def test_a_pipeline_without_stages_is_a_mistake(files, stages):
     head = PIPELINE[: PIPELINE.index("[[stage]]")]
     files["pipeline"].write_text(head + stages)
-    assert mistakes_of(load_pipeline, files["pipeline"])[0].startswith("stage")
+    for load in (load_pipeline, load_dataset_recipe):
+        assert mistakes_of(load, files["pipeline"])[0].startswith("stage")
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,12 @@
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 
-from cnpgen.errors import UsageError
-from cnpgen.library import list_recipes, load_dataset_recipe
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.library import list_recipes, load_dataset_recipe, load_problem
 from cnpgen.pipelines.stage import Stage
 from cnpgen.recipes import (
     DatasetRecipe,
@@ -175,3 +176,17 @@ def test_every_shipped_dataset_loads_and_resolves(name):
     assert recipe.name == name
     assert all(":" not in stage["use"] for stage in resolved(recipe)["pipeline"]["stage"])
     assert split_rows(recipe, sum(recipe.splits.values())) == recipe.splits
+
+
+def thin_object(folder: Path, size: str) -> Path:
+    """The shipped heavy object with other edge lengths."""
+    shipped = list_recipes("problem")["heavy-object"]
+    text = shipped.read_text().replace('urdf = "', f'urdf = "{shipped.parent}/').replace("[0.2, 0.2, 0.3] m", size)
+    (folder / "problem.toml").write_text(text)
+    return folder / "problem.toml"
+
+
+def test_an_object_must_be_thicker_than_its_contacts_may_be_deep(tmp_path):
+    with pytest.raises(RecipeError, match=r"object: is 0.002 m thin, where contacts 0.001 m deep are legal"):
+        load_problem(thin_object(tmp_path, "[200, 200, 2] mm"))
+    assert load_problem(thin_object(tmp_path, "[200, 200, 2.1] mm")).object.size[2] == 0.0021

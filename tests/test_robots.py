@@ -129,12 +129,12 @@ def test_base_on_its_limit_is_inside():
         (
             'name="joint_3" type="revolute"',
             'name="joint_3" type="continuous"',
-            "'joint_3' is a joint of type JointModelRU",
+            "'joint_3' is a continuous joint, which has no limits (make it revolute, with limits)",
         ),
         (
             'name="joint_3" type="revolute"',
             'name="joint_3" type="floating"',
-            "'joint_3' is a joint of type JointModelFree",
+            "'joint_3' is a floating joint: only revolute and prismatic joints can be planned",
         ),
         ('<parent link="link_6"/>', '<parent link="link_4"/>', "'joint_7' is not moved by 'joint_6'"),
         ('effort="110"', 'effort="0"', "joint_5: the torque limit must be positive and finite, got 0"),
@@ -144,6 +144,51 @@ def test_base_on_its_limit_is_inside():
 )
 def test_robots_that_cannot_be_planned_are_refused(tmp_path, old, new, expected):
     assert expected in mistake_of(with_urdf(tmp_path, old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ('upper="2.0943951023931953"', 'upper="-3"', "-2.0944 and -3"),
+        ('lower="-2.0943951023931953" upper="2.0943951023931953"', "", "0 and 0"),
+    ],
+    ids=["empty", "not given"],
+)
+def test_joints_need_a_range_to_move_in(tmp_path, old, new, found):
+    mistake = mistake_of(with_urdf(tmp_path, old, new))
+    assert f"joint_2: the lower position limit must be below the upper one, got {found}" in mistake
+
+
+FINGER = """
+<link name="finger"/>
+<joint name="finger_joint" type="prismatic">
+  <parent link="link_7"/><child link="finger"/><axis xyz="0 0 1"/>
+  <limit lower="0" upper="0.1" effort="1" velocity="1"/><mimic joint="{other}" multiplier="1" offset="{offset}"/>
+</joint>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("other", "offset", "expected"),
+    [
+        ("joint_6", "0", "'finger_joint' mimics the planned joint 'joint_6', but would stay at zero"),
+        ("other_finger", "0.02", "'finger_joint' mimics 'other_finger' with an offset, but would stay at zero"),
+    ],
+)
+def test_joints_that_mimic_others_and_would_stand_elsewhere_are_refused(tmp_path, other, offset, expected):
+    assert expected in mistake_of(with_urdf(tmp_path, "</robot>", FINGER.format(other=other, offset=offset)))
+
+
+def test_a_joint_that_mimics_another_cannot_be_planned(tmp_path):
+    mimic = '<mimic joint="joint_2"/>\n<axis'
+    urdf = HEAVY.urdf_path.read_text()
+    at = urdf.index("<axis", urdf.index('name="joint_5"'))
+    problem = with_urdf(tmp_path, urdf[at - 40 : at + 5], urdf[at - 40 : at] + mimic)
+    assert "'joint_5' mimics 'joint_2' and cannot be planned by itself" in mistake_of(problem)
+
+
+def test_a_joint_that_mimics_another_that_stays_at_zero_is_no_obstacle(tmp_path):
+    assert load_robot(with_urdf(tmp_path, "</robot>", FINGER.format(other="other_finger", offset="0"))).n == 7
 
 
 def test_continuous_joint_that_is_locked_is_no_obstacle(tmp_path):

@@ -69,7 +69,7 @@ def fast(prepare: Prepare) -> tuple[PreparedPipeline, Batch]:
 def suspects(fast: tuple[PreparedPipeline, Batch]) -> list[Case]:
     """States that a straight line of 80 ms carries off the table: starts, and goals reversed in time."""
     prepared, batch = fast
-    table, arm = prepared.context.constraint(Table, "test"), Arm(prepared.context.robot)
+    table, arm = prepared.context.constraint(Table), Arm(prepared.context.robot)
     cases = []
     for end, sign in (("start", 1.0), ("goal", -1.0)):
         for q, dq in zip(batch[f"{end}_q"].T, sign * batch[f"{end}_dq"].T, strict=True):
@@ -82,7 +82,7 @@ def suspects(fast: tuple[PreparedPipeline, Batch]) -> list[Case]:
 
 
 def kernels(prepared: PreparedPipeline, backend: str, kernels_of):
-    table, library = prepared.context.constraint(Table, "test"), kernels_of(prepared, backend)
+    table, library = prepared.context.constraint(Table), kernels_of(prepared, backend)
     return table, library.load(tip_state), library.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
 
 

@@ -65,7 +65,7 @@ def test_the_segment_stage_and_the_coal_stage_reject_the_same_arms(heavy, anywhe
 
 def test_coal_s_verdict_on_arm_and_object_agrees_with_the_verifier_s_distances(heavy, anywhere, measured):
     """Where neither is within 2 mm of its limit: a smaller object and a depth are not quite the same thing there."""
-    depth = heavy.context.constraint(ObjectContact, "test").depth
+    depth = heavy.context.constraint(ObjectContact).depth
     hit = coal_judge(heavy.context.problem, heavy.context.robot, RADIUS, depth)(*anywhere)
     arm, held = measured
     clear = (np.abs(arm - RADIUS) > 1e-6) & (np.abs(held + depth) > 2e-3)
@@ -133,9 +133,9 @@ def test_coal_alone_rejects_what_the_segments_reject(heavy):
 
 
 def test_a_problem_without_obstacles_has_no_collision_stage(prepare: Prepare):
-    with pytest.raises(RecipeError, match="stage 'collision' needs a constraint 'RobotClearance'"):
+    with pytest.raises(RecipeError, match="needs a constraint 'robot-clearance'"):
         Collision(end="start", judge="segments").prepare(prepare("airhockey-hit").context)
 
 
 def test_the_radius_is_the_problem_s(heavy):
-    assert heavy.context.constraint(RobotClearance, "test").radius == RADIUS
+    assert heavy.context.constraint(RobotClearance).radius == RADIUS

@@ -149,7 +149,7 @@ def test_the_goal_is_solved_from_the_start(prepare):
 def test_a_guess_of_the_wrong_length_is_a_mistake_in_the_recipe(prepare):
     prepared = prepare("airhockey-replan")
     stage = prepared.pipeline.stage[1]
-    with pytest.raises(RecipeError, match="start-ik: guess: needs 6 ranges, one per planned joint, got 5"):
+    with pytest.raises(RecipeError, match="guess: needs 6 ranges, one per planned joint, got 5"):
         replace(stage, guess=stage.guess[:5]).prepare(prepared.context)
 
 

@@ -56,7 +56,7 @@ def test_starts_and_hits_that_leave_the_table_are_rejected_and_no_others(prepare
 @pytest.mark.parametrize(("name", "start_time"), [("airhockey-hit", 0.0), ("airhockey-replan", 0.02)])
 def test_no_accepted_row_leaves_the_table_by_pinocchio_s_velocities(prepare: Prepare, name, start_time):
     prepared = prepare(name)
-    table = prepared.context.constraint(Table, "test")
+    table = prepared.context.constraint(Table)
     batch = run_stages(prepared, 3000, seed=71)
     arm = Arm(prepared.context.robot)
     ends = [("start", start_time), ("goal", 0.05), ("goal", -0.05)]
@@ -70,7 +70,7 @@ def test_no_accepted_row_leaves_the_table_by_pinocchio_s_velocities(prepare: Pre
 def test_the_rule_rejects_exactly_the_draws_that_numpy_says_leave(prepare: Prepare):
     pipeline = without_stages(prepare("airhockey-replan").pipeline, "BallisticReach")
     prepared = prepare(pipeline)
-    table = prepared.context.constraint(Table, "test")
+    table = prepared.context.constraint(Table)
     batch = run_stages(prepared, 3000, seed=72)
     velocity = batch["hit_speed"] * np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
     inside = np.ones(len(batch.alive), bool)
@@ -105,5 +105,5 @@ def test_a_stage_that_needs_what_no_stage_wrote_is_a_mistake_in_the_recipe(prepa
 
 
 def test_the_rule_needs_a_table(prepare: Prepare):
-    with pytest.raises(RecipeError, match="stage 'ballistic-reach' needs a constraint 'Table'"):
+    with pytest.raises(RecipeError, match="needs a constraint 'table'"):
         BallisticReach(goal_time=0.05).prepare(prepare("heavy-object").context)

@@ -64,11 +64,11 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
 
 def _kind(name_or_path: str) -> "Kind":
     """Find out what kind of recipe is meant."""
-    from cnpgen.library import list_recipes
+    from cnpgen.library import kind_of_file, list_recipes
 
     path = Path(name_or_path)
     if path.is_file():
-        return _kind_of_file(path)
+        return kind_of_file(path)
     if path.suffix == ".toml" or "/" in name_or_path or os.sep in name_or_path:
         return "dataset"  # the error is the same for every kind: no such file
     for kind in KINDS:
@@ -76,16 +76,3 @@ def _kind(name_or_path: str) -> "Kind":
             return kind
     known = sorted({name for kind in KINDS for name in list_recipes(kind)})
     raise RecipeError([f"unknown recipe {name_or_path!r}{nearest(name_or_path, known)}; known: {', '.join(known)}"])
-
-
-def _kind_of_file(path: Path) -> "Kind":
-    """Tell the kind of a recipe file by its keys; of a file that cannot be read the loader says what is wrong."""
-    import tomllib
-
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError):
-        return "dataset"
-    if "robot" in table:
-        return "problem"
-    return "pipeline" if "stage" in table else "dataset"

@@ -53,7 +53,7 @@ class BrakingReach(Stage):
 
     def prepare(self, context: Context) -> Run:
         """Load the kernels."""
-        table = context.constraint(Table, "braking-reach")
+        table = context.constraint(Table)
         tip = context.kernels.load(tip_state)
         brake = context.kernels.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
 

@@ -56,7 +56,7 @@ class Collision(Stage):
 
     def prepare(self, context: Context) -> Run:
         """Load the kernel or build the geometry."""
-        radius = context.constraint(RobotClearance, "collision").radius
+        radius = context.constraint(RobotClearance).radius
         return self._by_coal(context, radius) if self.judge == "coal" else self._by_segments(context, radius)
 
     def _ends(self) -> tuple[str, ...]:
@@ -74,7 +74,7 @@ class Collision(Stage):
         return run
 
     def _by_coal(self, context: Context, radius: float) -> Run:
-        depth = context.constraint(ObjectContact, "collision").depth
+        depth = context.constraint(ObjectContact).depth
         judge = coal_judge(context.problem, context.robot, radius, depth)
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
@@ -147,9 +147,7 @@ def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
     import pinocchio as pin
 
     if any(joint.prismatic for joint in robot.chain.joints):
-        raise RecipeError(
-            ["stage 'collision' with judge = \"coal\" needs revolute joints: links that slide change length"]
-        )
+        raise RecipeError(['judge: "coal" needs revolute joints: links that slide change length'])
     model = robot.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))

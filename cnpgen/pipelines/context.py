@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import TypeVar
 
+from cnpgen import plugins
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
@@ -29,18 +30,17 @@ class Context:
     kernels: KernelLibrary
     dtype: str = "float64"
 
-    def constraint(self, kind: type[Kind], stage: str) -> Kind:
+    def constraint(self, kind: type[Kind]) -> Kind:
         """Return the problem's constraint of a kind.
 
         Raises:
-            RecipeError: The problem has none, so that ``stage`` has no meaning in it.
+            RecipeError: The problem has none, so that a stage that asks for it has no meaning there.
         """
         for constraint in self.problem.constraint:
             if isinstance(constraint, kind):
                 return constraint
-        raise RecipeError(
-            [f"{self.problem.path}: stage {stage!r} needs a constraint {kind.__name__!r}, the problem has none"]
-        )
+        name = plugins.name_of(plugins.CONSTRAINTS, kind)
+        raise RecipeError([f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"])
 
     def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:
         """Describe a field with one column per planned joint, bounded by the planning limits of its unit."""

@@ -22,7 +22,7 @@ class DrawPositions(Stage):
     def describe(self) -> str:
         """Say what is drawn."""
         text = f"draw a start position in {_box(self.start)} m and a goal position in {_box(self.goal)} m"
-        return f"{text}, at least {self.min_distance:g} m apart" if self.min_distance else text
+        return f"{text}, at least {self.min_distance:g} m apart horizontally" if self.min_distance else text
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """Both positions."""
@@ -62,7 +62,7 @@ class DrawPositions(Stage):
             distance = float(np.linalg.norm(nearest - shoulder))
             if distance > context.robot.chain.reach:
                 mistakes.append(
-                    f"draw-positions: {end}: the whole box {_box(box)} m is out of reach:"
+                    f"{end}: the whole box {_box(box)} m is out of reach:"
                     f" {distance:.2f} m from the first joint, the arm is {context.robot.chain.reach:.2f} m long"
                 )
         if mistakes:

@@ -44,7 +44,7 @@ class HittingConfiguration(Stage):
         """Load the kernels."""
         robot = context.robot
         if robot.n < 3 or any(joint.prismatic for joint in robot.chain.joints):
-            raise RecipeError(["hitting-configuration needs three or more joints, all of them revolute"])
+            raise RecipeError(["needs three or more planned joints, all of them revolute"])
         search = _Search(context)
 
         def run(batch: Batch, _random: np.random.Generator) -> None:

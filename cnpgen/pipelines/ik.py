@@ -74,7 +74,7 @@ class StartIK(_IK):
         """Load the kernel."""
         n = context.robot.n
         if self.guess and len(self.guess) != n:
-            raise RecipeError([f"start-ik: guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
+            raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
         guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
         solve_start = self._solve(context, "start", "guess_q")
 

@@ -81,7 +81,7 @@ class TableVelocity(Stage):
 
     def prepare(self, context: Context) -> Run:
         """Load the kernel."""
-        context.constraint(Table, "table-velocity")
+        context.constraint(Table)
         kernel, n = context.kernels.load(table_velocity), context.robot.n
 
         def run(batch: Batch, random: np.random.Generator) -> None:
@@ -117,7 +117,7 @@ class TableAcceleration(Stage):
 
     def prepare(self, context: Context) -> Run:
         """Load the kernel."""
-        context.constraint(Table, "table-acceleration")
+        context.constraint(Table)
         kernel, n = context.kernels.load(table_acceleration), context.robot.n
 
         def run(batch: Batch, random: np.random.Generator) -> None:

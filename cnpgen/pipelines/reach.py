@@ -41,7 +41,7 @@ class BallisticReach(Stage):
 
     def prepare(self, context: Context) -> Run:
         """Look up the table."""
-        table = context.constraint(Table, "ballistic-reach")
+        table = context.constraint(Table)
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             if self.start_time:

@@ -19,7 +19,15 @@ from cnpgen.store.documents import canonical_sha256, plain
 
 Array = NDArray[np.float64]
 
+<<<<<<< HEAD
 _JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
+=======
+_JUDGED_BY = (
+    "tolerance",
+    "budget",
+    "weight",
+)  # of constraints: how strictly a plan is judged, not what it is a plan for
+>>>>>>> 348eed6 (tmp)
 
 
 @dataclass(frozen=True)

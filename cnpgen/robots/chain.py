@@ -14,6 +14,15 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+_PLANNED = "only revolute and prismatic joints can be planned"
+_KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
+    "JointModelRUB": "a continuous joint, which has no limits (make it revolute, with limits)",
+    "JointModelFreeFlyer": "a floating joint",
+    "JointModelPlanar": "a planar joint",
+    "JointModelSpherical": "a spherical joint",
+}
+
+
 @dataclass(frozen=True)
 class Joint:
     """One planned joint and the rigid body that it moves.
@@ -68,10 +77,9 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     """
     data = model.createData()
     for index in range(1, model.njoints):
-        name, kind = model.names[index], model.joints[index].shortname()
-        if model.joints[index].nq != 1 or model.joints[index].nv != 1:
-            needed = "only revolute and prismatic ones are supported (a continuous one needs limits)"
-            raise RecipeError([f"robot.joints: {name!r} is a joint of type {kind}, {needed}"])
+        name, joint = model.names[index], model.joints[index]
+        if joint.nq != 1 or joint.nv != 1:
+            raise RecipeError([f"robot.joints: {name!r} is {_kind(joint.shortname())}: {_PLANNED}"])
         if model.parents[index] != index - 1:
             before = model.names[index - 1]
             raise RecipeError([f"robot.joints: {name!r} is not moved by {before!r}, expected one serial chain"])
@@ -85,6 +93,11 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     return Chain(
         joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear)
     )
+
+
+def _kind(name: str) -> str:
+    """Say what Pinocchio's type of a joint is."""
+    return next((text for start, text in _KINDS.items() if name.startswith(start)), "a joint of another kind")
 
 
 def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:

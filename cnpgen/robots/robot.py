@@ -1,5 +1,6 @@
 """A robot: its Pinocchio model reduced to the planned joints, and the planning limits that the problem sets."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.recipes import Problem
 from cnpgen.robots.chain import Chain, chain_from_model
+from cnpgen.robots.mimic import check_mimic
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -77,6 +79,7 @@ def load_robot(problem: Problem) -> Robot:
     """
     spec, limits = problem.robot, problem.limits
     try:
+        check_mimic(problem.urdf_path, spec.joints)
         model = _reduced_model(problem.urdf_path, spec.joints)
         chain = chain_from_model(model, spec.tip)
     except RecipeError as error:
@@ -97,7 +100,8 @@ def load_robot(problem: Problem) -> Robot:
         base=np.array(spec.base),
         chain=chain,
     )
-    _check(problem, robot)
+    if mistakes := list(_mistakes(problem, robot)):
+        raise RecipeError(mistakes)
     return robot
 
 
@@ -151,24 +155,30 @@ def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
     return tuple((a, b) for a, b in pairwise(kept) if not (still(a) and still(b)))
 
 
-def _check(problem: Problem, robot: Robot) -> None:
-    """Raise RecipeError for limits that no motion can meet."""
-    mistakes = []
-    if robot.base.shape != (robot.n,):
-        mistakes.append(
-            f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {robot.base.size}"
+def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
+    """Say which limits no motion can meet."""
+    limits = {"velocity": robot.velocity_limit, "torque": robot.torque_limit}
+    for what, values in limits.items():
+        for name, value in zip(robot.joint_names, values, strict=True):
+            if not (np.isfinite(value) and value > 0):
+                yield f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
+    low, high = np.array(robot.model.lowerPositionLimit), np.array(robot.model.upperPositionLimit)
+    for joint in np.flatnonzero(~(low < high)):
+        text = f"the lower position limit must be below the upper one, got {low[joint]:g} and {high[joint]:g}"
+        yield f"{robot.urdf}: {robot.joint_names[joint]}: {text}"
+    if (low < high).all():
+        yield from _base_mistakes(problem, robot)
+
+
+def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
+    """Say whether the base configuration fits the joints and their limits."""
+    low, high, base = robot.position_lower, robot.position_upper, robot.base
+    if base.shape != low.shape:
+        yield f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {base.size}"
+        return
+    worst = int(np.argmax(np.maximum(low - base, base - high)))
+    if not low[worst] <= base[worst] <= high[worst]:
+        yield (
+            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} rad is outside its planning"
+            f" limits [{low[worst]:g}, {high[worst]:g}]"
         )
-    elif np.any(robot.base < robot.position_lower) or np.any(robot.base > robot.position_upper):
-        worst = int(np.argmax(np.maximum(robot.position_lower - robot.base, robot.base - robot.position_upper)))
-        mistakes.append(
-            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {robot.base[worst]:g} rad is outside its"
-            f" planning limits [{robot.position_lower[worst]:g}, {robot.position_upper[worst]:g}]"
-        )
-    for what, limit in (("velocity", robot.velocity_limit), ("torque", robot.torque_limit)):
-        mistakes.extend(
-            f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
-            for name, value in zip(robot.joint_names, limit, strict=True)
-            if not (np.isfinite(value) and value > 0)
-        )
-    if mistakes:
-        raise RecipeError(mistakes)
