@@ -6,9 +6,9 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,12 @@ from cnpgen.library import restore_dataset_recipe
 from cnpgen.recipes import Problem, TrajectorySpec, resolved
 from cnpgen.store.documents import canonical_sha256, plain
 
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
 Array = NDArray[np.float64]
 
-<<<<<<< HEAD
 _JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
-=======
-_JUDGED_BY = (
-    "tolerance",
-    "budget",
-    "weight",
-)  # of constraints: how strictly a plan is judged, not what it is a plan for
->>>>>>> 348eed6 (tmp)
 
 
 @dataclass(frozen=True)
@@ -105,11 +100,9 @@ class ProblemRecord:
         """
         import pinocchio as pin
 
-        from cnpgen.robots.robot import load_robot
-
-        with self.restored() as problem:
-            model = load_robot(problem).model
-        data, frame = model.createData(), model.getFrameId(problem.robot.tip)
+        _, robot = open_problem(self)
+        model = robot.model
+        data, frame = model.createData(), model.getFrameId(robot.tip)
         found = np.empty((len(q), 3))
         for row, configuration in enumerate(q):
             pin.forwardKinematics(model, data, configuration)
@@ -121,6 +114,21 @@ def record_problem(problem: Problem) -> ProblemRecord:
     """Write a problem and its URDF down."""
     recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
     return ProblemRecord(recipe, problem.urdf_path.read_bytes().decode())
+
+
+@lru_cache(maxsize=8)
+def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
+    """Rebuild a problem and its robot, which is loaded as far as Pinocchio's model; the files are gone afterwards.
+
+    Raises:
+        RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+    """
+    from cnpgen.robots.robot import load_robot
+
+    with record.restored() as problem:
+        robot = load_robot(problem)
+        robot.skeleton  # noqa: B018 - it and the model are read from the URDF when they are first asked for
+    return problem, robot
 
 
 def _meaning(record: ProblemRecord) -> dict[str, Any]:
