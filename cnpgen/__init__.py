@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
     from cnpgen.inspection import inspect_dataset
     from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, load_problem
+    from cnpgen.loader.load import load_dataset
     from cnpgen.make import make_dataset
     from cnpgen.store.reader import open_dataset
     from cnpgen.validation import validate_dataset
@@ -26,6 +27,7 @@ _HOME = {
     "check_machine": "doctor",
     "inspect_dataset": "inspection",
     "list_recipes": "library",
+    "load_dataset": "loader.load",
     "load_dataset_recipe": "library",
     "load_pipeline": "library",
     "load_problem": "library",
@@ -44,6 +46,7 @@ __all__ = [
     "check_machine",
     "inspect_dataset",
     "list_recipes",
+    "load_dataset",
     "load_dataset_recipe",
     "load_pipeline",
     "load_problem",

@@ -21,18 +21,21 @@ LAYERS = (
     ("kernels",),
     ("pipelines",),
     ("store", "trajectory", "verify"),
-    ("verdict", "plans", "losses", "refine", "export", "plan_plots"),
+    ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
+    ("interop",),
     ("make_shard", "make", "validation", "inspection", "describe", "plots", "doctor"),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.
 APART = {
     "store": ("kernels", "pipelines", "robots", "refine"),
+    "loader": ("kernels", "pipelines", "robots", "refine", "verify", "recipes", "trajectory"),
     "verify": ("kernels", "pipelines", "refine", "robots.symbolic", "robots.linalg", "robots.boxes"),
     "verdict": ("kernels", "pipelines", "refine", "robots.symbolic", "robots.linalg", "robots.boxes"),
     "trajectory": ("kernels", "pipelines", "robots", "refine", "verify"),
 }
 HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp")
+FRAMEWORKS = ("torch", "jax", "tensorflow")
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if "_recipes" not in path.parts
 )
@@ -111,11 +114,17 @@ def test_no_module_imports_a_heavy_library_at_its_top(module: Path) -> None:
     assert not found & set(HEAVY)
 
 
+def test_only_the_bridge_of_a_framework_imports_it() -> None:
+    for module in MODULES:
+        found = {imported.split(".")[0] for imported in imports(module)} & set(FRAMEWORKS)
+        assert found <= ({module.name} if within(name(module), "interop") else set()), f"{name(module)} imports {found}"
+
+
 @pytest.mark.parametrize(
     "statement", ["import cnpgen", "import cnpgen.library", "from cnpgen.cli.main import main; main(['list'])"]
 )
 def test_importing_recipes_or_listing_them_loads_nothing_heavy(statement: str) -> None:
-    code = f"{statement}\nimport sys\nprint('LOADED', *sorted(set({HEAVY!r}) & set(sys.modules)))"
+    code = f"{statement}\nimport sys\nprint('LOADED', *sorted(set({(*HEAVY, *FRAMEWORKS)!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "LOADED"
 
@@ -146,7 +155,7 @@ from contextlib import suppress
 from cnpgen.cli.main import main
 with suppress(SystemExit):
     main([*{command.split()!r}, "--help"])
-print("LOADED", *sorted(set({(*HEAVY, "numpy.testing")!r}) & set(sys.modules)))
+print("LOADED", *sorted(set({(*HEAVY, *FRAMEWORKS, "numpy.testing")!r}) & set(sys.modules)))
 """
     assert python(code) == "LOADED"
 

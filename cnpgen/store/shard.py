@@ -235,3 +235,30 @@ def read_schema(path: Path) -> dict[str, StoredField]:
             name: StoredField(getattr(item, "shape", ()), getattr(item, "dtype", None), dict(item.attrs))
             for name, item in file.items()
         }
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a shard keeps the values of a field.
+
+    Attributes:
+        shape: Shape of the values.
+        dtype: Their stored type.
+        offset: Where they begin in the file [bytes]; None if they are not there in one piece, as cnpgen writes them,
+            but in chunks, maybe compressed.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    offset: int | None
+
+
+def read_placements(path: Path) -> dict[str, Placement]:
+    """Read where a shard keeps its fields, so that they can be mapped into memory.
+
+    Raises:
+        DatasetError: The file is missing, damaged or cut off.
+        MachineError: The system would not let us read it.
+    """
+    with opened_hdf5(path) as file:
+        return {name: Placement(item.shape, item.dtype, item.id.get_offset()) for name, item in file.items()}

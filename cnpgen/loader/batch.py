@@ -1,0 +1,49 @@
+"""One batch of rows: a mapping from field names to arrays, which are views of one packed table."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cnpgen.loader.columns import Columns
+
+
+@dataclass(frozen=True, eq=False)
+class Batch(Mapping[str, NDArray[Any]]):
+    """B rows. The arrays are the batch's own: nobody writes to them later, and they may be changed or kept.
+
+    ``batch["start_q"]`` has shape (B, width), or (B,) for a scalar field. Fields of numbers are views of ``table``,
+    so that taking one costs nothing; ``dict(batch)`` is a plain dict of them.
+
+    Attributes:
+        table: The fields of numbers side by side, C-contiguous, shape (B, D).
+        layout: Which fields there are and where.
+        integers: The fields of integers, int64, shape (B, width) or (B,).
+    """
+
+    table: NDArray[Any]
+    layout: Columns
+    integers: Mapping[str, NDArray[Any]]
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Field name -> its columns of the table."""
+        return self.layout.slices
+
+    @property
+    def rows(self) -> int:
+        """Number of rows B."""
+        return len(self.table)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name in self.integers:
+            return self.integers[name]
+        part = self.layout.slices[name]
+        return self.table[:, part.start if name in self.layout.scalars else part]
+
+    def __iter__(self) -> Iterator[str]:
+        return (field.name for field in self.layout.fields)
+
+    def __len__(self) -> int:
+        return len(self.layout.fields)

@@ -1,0 +1,93 @@
+"""The batches of a split, epoch by epoch, from any row on."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from cnpgen.errors import UsageError
+from cnpgen.loader.batch import Batch
+from cnpgen.loader.cut import Cut
+from cnpgen.loader.form import Form
+from cnpgen.loader.order import Order
+from cnpgen.loader.position import Position, position_from_json, position_to_json
+from cnpgen.loader.source import Source
+from cnpgen.loader.windows import Windows
+
+
+class Batches:
+    """Every ``for`` over it gives the rest of an epoch and leaves it at the beginning of the next one.
+
+    The order is a function of seed, epoch and shards alone. Holds no rows between two loops, can be pickled and forked.
+
+    Args:
+        source: Where rows come from.
+        form: What is wanted of them.
+        cut: How they are dealt out.
+        position: Where to begin.
+
+    Raises:
+        UsageError: There are fewer rows than one batch needs.
+    """
+
+    def __init__(self, source: Source, form: Form, cut: Cut, position: Position) -> None:
+        if cut.drop_last and cut.batch_size > source.rows:
+            raise UsageError(
+                f"batch_size {cut.batch_size} is more than the {source.rows} rows of split {source.split!r};"
+                " drop_last=False gives them as one batch"
+            )
+        self._source, self._form, self._cut, self._position = source, form, cut, position
+
+    @property
+    def epoch(self) -> int:
+        """Number of the epoch that the next batch is of; may be set, to begin another one."""
+        return self._position.epoch
+
+    @epoch.setter
+    def epoch(self, epoch: int) -> None:
+        self._position = replace(self._position, epoch=epoch, row=0)
+
+    def __len__(self) -> int:
+        """Return the number of batches in a whole epoch."""
+        return self._cut.count(self._source.rows)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Give the batches from here to the end of the epoch.
+
+        Raises:
+            DatasetError: A shard is missing or damaged.
+            UsageError: Something else moved the position between two batches.
+        """
+        source, cut, position = self._source, self._cut, self._position
+        rows = tuple(shard.rows for shard in source.shards)
+        order = Order(source.split, rows, position.seed, position.epoch, position.shuffle)
+        windows, end = Windows(source, self._form, order), cut.end(source.rows, first=position.row)
+        while (first := position.row + cut.worker * cut.batch_size) < end:
+            batch = windows.batch(first, min(first + cut.batch_size, end), rank=cut.rank, world=cut.world)
+            row = min(position.row + cut.workers * cut.batch_size, end)
+            self._position = position = replace(position, row=row)
+            yield batch
+            if self._position is not position:
+                raise UsageError(
+                    "batches were taken by another loop, or load_state was called, within a loop over the same batches"
+                )
+        self._position = replace(position, epoch=position.epoch + 1, row=0)
+
+    def state(self) -> dict[str, Any]:
+        """Say where it is, as a small JSON-able dict, the same on every rank; batches handed out are behind it."""
+        return position_to_json(self._position, self._source)
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go to where ``state()`` was called: the next loop begins with the batch after it and reads none before.
+
+        The state brings its seed, epoch and shuffling along. Batch size, ranks, fields and form are this object's own;
+        a state counts rows, so that it may be loaded with another batch size or number of ranks.
+
+        Raises:
+            UsageError: This is not the state of a loader.
+            DatasetError: It is of another dataset or split.
+        """
+        self._position = position_from_json(state, self._source)
+
+    def for_worker(self, worker: int, workers: int) -> "Batches":
+        """Return the part of one of several workers, which take the batches from here on in turn."""
+        return Batches(self._source, self._form, replace(self._cut, worker=worker, workers=workers), self._position)

@@ -1,0 +1,101 @@
+"""Opening a dataset for training: what is not whole is refused."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError
+from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.shards import AGAIN, Shard, ShardReader
+from cnpgen.store.documents import load_document
+from cnpgen.store.layout import STATS
+from cnpgen.store.manifest import data_fingerprint
+from cnpgen.store.plan import DatasetPlan
+from cnpgen.store.reader import open_dataset
+from cnpgen.store.statistics import FieldStatistics, statistics_from_json
+from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise
+
+Statistics = dict[str, dict[str, FieldStatistics]]
+
+
+def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: bool = True) -> Dataset:
+    """Open a dataset for training.
+
+    That the shards are there and have their sizes is checked now; header and sha256 of each when it is first read.
+
+    Args:
+        folder: Its folder.
+        allow_incomplete: Take the shards that are there, if the dataset is unfinished or has lost some.
+        verify: Compare the sha256 of every shard, once, when it is first read.
+
+    Raises:
+        DatasetError: There is no dataset, it is unfinished, or a part of it is missing or damaged.
+        MachineError: The system would not let us read something.
+    """
+    folder = Path(folder)
+    stored = open_dataset(folder, allow_partial=allow_incomplete)
+    if stored.manifest is None:
+        summary = summarise(folder, stored.plan, allow_partial=True)
+        shards, statistics = _recorded(folder, summary), summary.statistics
+    else:
+        shards, statistics = _listed(folder, stored.plan, stored.manifest), _load_statistics(folder, stored.plan)
+    present = _present(folder, shards, allow_incomplete=allow_incomplete)
+    fingerprint = data_fingerprint(
+        (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
+    )
+    return Dataset(folder, stored.plan, fingerprint, present, statistics, ShardReader(verify=verify))
+
+
+def _recorded(folder: Path, summary: Summary) -> dict[str, list[Shard]]:
+    """List the shards of an unfinished dataset by their sidecars."""
+    plan = summary.plan
+    return {
+        split: [
+            Shard(folder / task.file, record.rows, record.first_sample_id, record.bytes, record.sha256, plan.key)
+            for task, record in summary.of_split(split)
+        ]
+        for split in plan.splits
+    }
+
+
+def _listed(folder: Path, plan: DatasetPlan, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
+    """List the shards of a finished dataset by its manifest."""
+    return {
+        split: [
+            Shard(
+                folder / entry["file"],
+                entry["rows"],
+                entry["first_sample_id"],
+                entry["bytes"],
+                entry["sha256"],
+                plan.key,
+            )
+            for entry in content["shards"]
+        ]
+        for split, content in manifest["splits"].items()
+    }
+
+
+def _load_statistics(folder: Path, plan: DatasetPlan) -> Statistics:
+    """Read the statistics of a finished dataset."""
+    path = folder / STATS
+    document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+    if document["plan_fingerprint"] != plan.fingerprint:
+        raise DatasetError(f"{path} is of another plan than plan.json; {AGAIN}")
+    return {
+        split: {name: statistics_from_json(content) for name, content in fields.items()}
+        for split, fields in document["splits"].items()
+    }
+
+
+def _present(
+    folder: Path, shards: Mapping[str, list[Shard]], *, allow_incomplete: bool
+) -> dict[str, tuple[Shard, ...]]:
+    """Return the shards that are there; refuse, unless it is allowed, to do without the others."""
+    problems = [problem for part in shards.values() for shard in part if (problem := shard.problem())]
+    if problems and not allow_incomplete:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise DatasetError(
+            f"{folder} is damaged: {problems[0]}{more}; {AGAIN}, or pass allow_incomplete=True to do without"
+        )
+    return {split: tuple(shard for shard in part if not shard.problem()) for split, part in shards.items()}

@@ -1,0 +1,136 @@
+"""The shards of a dataset that are there, and reading whole fields of one: mapped into memory where possible."""
+
+import mmap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError
+from cnpgen.fields import Field
+from cnpgen.loader.columns import tail
+from cnpgen.store.files import file_sha256, machine_error
+from cnpgen.store.shard import Placement, read_attributes, read_placements, read_shard
+
+MOST_MAPS = 32  # that random access keeps; each holds a file descriptor
+AGAIN = "run the same make-dataset command again"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A shard and what is recorded of it.
+
+    Attributes:
+        path: Its file.
+        rows: Number of rows.
+        first_row: Index of its first row within the split, as it was planned.
+        size: Size of the file [bytes].
+        sha256: Its digest.
+        key: The plan's key, which the file repeats.
+    """
+
+    path: Path
+    rows: int
+    first_row: int
+    size: int
+    sha256: str
+    key: int
+
+    def problem(self) -> str:
+        """Say what is wrong with the file without opening it; nothing if its size is right."""
+        if not self.path.is_file():
+            return f"{self.path} is missing"
+        size = self.path.stat().st_size
+        return "" if size == self.size else f"{self.path} has {size} bytes instead of {self.size}"
+
+
+class ShardReader:
+    """Reads fields of shards; every shard is checked once, when it is first read.
+
+    Holds no open files but a few memory maps for random access. It may be used by several threads, pickled (without its
+    maps) and forked.
+
+    Args:
+        verify: Compare each shard's sha256 with the recorded one before its first use; else only size and header.
+    """
+
+    def __init__(self, *, verify: bool) -> None:
+        self._verify = verify
+        self._placements: dict[Path, dict[str, Placement]] = {}  # of the shards that were checked
+        self._maps: dict[Path, mmap.mmap] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_maps": {}}
+
+    def read(self, shard: Shard, fields: Sequence[Field], *, keep: bool = False) -> dict[str, NDArray[Any]]:
+        """Give whole fields of a shard.
+
+        Args:
+            shard: The shard.
+            fields: The fields.
+            keep: Keep the shard mapped for the next time.
+
+        Returns:
+            Field name -> values as stored, shape (rows, width) or (rows,), not writeable where mapped.
+
+        Raises:
+            DatasetError: The shard is missing, damaged, of another plan or lacks a field.
+            MachineError: The system would not let us read it.
+        """
+        placements = self._placements.get(shard.path) or self._check(shard)
+        for field in fields:
+            _check_field(shard, field, placements.get(field.name))
+        places = {field.name: placements[field.name] for field in fields}
+        mapped = None
+        if all(place.offset is not None and place.dtype.isnative for place in places.values()):
+            mapped = self._map(shard, keep=keep)
+        if mapped is None:
+            return read_shard(shard.path, list(places))
+        return {name: np.ndarray(p.shape, p.dtype, mapped, p.offset or 0) for name, p in places.items()}
+
+    def _check(self, shard: Shard) -> dict[str, Placement]:
+        if problem := shard.problem():
+            raise DatasetError(f"{problem}; {AGAIN}")
+        if self._verify and file_sha256(shard.path) != shard.sha256:
+            raise DatasetError(f"{shard.path} is damaged: its sha256 is not the recorded one; {AGAIN}")
+        found = read_attributes(shard.path, ["plan_key", "first_sample_id", "rows"])  # texts may hang HDF5: see there
+        if found != {"plan_key": shard.key, "first_sample_id": shard.first_row, "rows": shard.rows}:
+            raise DatasetError(f"{shard.path} is of another dataset or another place in it; {AGAIN}")
+        self._placements[shard.path] = placements = read_placements(shard.path)
+        return placements
+
+    def _map(self, shard: Shard, *, keep: bool) -> mmap.mmap | None:
+        """Map a shard into memory; None where the file system cannot."""
+        if (kept := self._maps.get(shard.path)) is not None:
+            return kept
+        mapped = _mapped(shard)
+        if keep and mapped is not None:
+            for oldest in list(self._maps)[: len(self._maps) - MOST_MAPS + 1]:
+                self._maps.pop(oldest, None)  # stays mapped for as long as arrays of it are in use
+            self._maps[shard.path] = mapped
+        return mapped
+
+
+def _mapped(shard: Shard) -> mmap.mmap | None:
+    try:
+        with shard.path.open("rb") as file:
+            if file.seek(0, 2) != shard.size:  # a map that reaches beyond the file would end the process
+                raise DatasetError(f"{shard.path} was changed while it was in use")
+            try:
+                return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            except (OSError, ValueError):
+                return None
+    except OSError as error:
+        raise machine_error("read", shard.path, error) from error
+
+
+def _check_field(shard: Shard, field: Field, found: Placement | None) -> None:
+    """Refuse a shard whose header does not say what the plan says of a field."""
+    shape = (shard.rows, *tail(field))
+    kind = "f" if field.dtype == "float" else "i"
+    if found is None or found.shape != shape or found.dtype.kind != kind:
+        text = "is missing" if found is None else f"is {found.dtype} of shape {found.shape}"
+        raise DatasetError(f"{shard.path}: field {field.name!r} {text}; the plan says {field.dtype} of shape {shape}")
