@@ -3,6 +3,7 @@
 import csv
 import errno
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,46 @@ def test_npz_says_which_plans_and_samples_there_are(tmp_path: Path) -> None:
         assert data["plan"].tolist() == [0, 9]
         assert data["sample_id"].tolist() == [0, 99]
         assert len(data.files) == 3 + 2 * 5
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_chosen_plans_keep_their_numbers(tmp_path: Path, form: Any) -> None:
+    plans = draw_plans()
+    every = read(export_plans(plans, tmp_path / "all", to=form, rate=50), form)
+    some = read(export_plans(plans, tmp_path / "some", to=form, rate=50, only=[5, 2, 5]), form)
+    assert list(some) == [2, 5]
+    for index, values in some.items():
+        for name, numbers in values.items():
+            assert np.array_equal(numbers, every[index][name])
+
+
+def test_of_the_plans_that_are_not_chosen_nothing_is_said(tmp_path: Path) -> None:
+    exported = export_plans(garbage(), tmp_path, to="csv", rate=50, only=[0, 4])
+    assert exported.count == 1
+    assert list(exported.refused) == [4]
+    for missing in (10, -1):
+        with pytest.raises(UsageError, match=f"there is no plan {missing}: 10 plans are numbered from 0"):
+            export_plans(garbage(), tmp_path, to="csv", only=[missing])
+
+
+def test_numbers_in_a_message_are_numbers_to_readers_of_yaml_1_1(tmp_path: Path) -> None:
+    """PyYAML's own expressions for floats and integers: what fits neither is a text to it."""
+    is_float = re.compile(r"[-+]?(?:[0-9][0-9_]*)\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?")
+    is_integer = re.compile(r"[-+]?(?:0|[1-9][0-9_]*)")
+    plans = draw_plans(n=2)
+    plans = replace(plans, path_control_points=plans.path_control_points * 1e-7)
+    plans.path_control_points[0, :4] = 1e-5  # a single digit before the exponent
+    exported = export_plans(plans, tmp_path, to="joint-trajectory", rate=200)
+    for path in exported.files:
+        text = path.read_text(encoding="utf-8")
+        assert "e-" in text
+        for number in re.findall(r"[-+.eE0-9]*[0-9][-+.eE0-9]*", text.partition('"points"')[2]):
+            assert is_float.fullmatch(number) or is_integer.fullmatch(number), number
+        values = read_message(path)
+        index = int(path.stem[-5:])
+        sampled = sample_plan(plans.motion[[index]], 200)
+        for name in ("q", "dq", "ddq"):
+            assert np.array_equal(values[name], getattr(sampled, name))
 
 
 def test_the_last_sample_is_neither_missing_nor_doubled() -> None:

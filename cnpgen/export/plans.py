@@ -1,0 +1,136 @@
+"""Sampling plans in time and writing them in one of several forms."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.export.csv_table import csv_table
+from cnpgen.export.joint_trajectory import joint_trajectory
+from cnpgen.export.npz import write_npz
+from cnpgen.export.sampled import Sampled, sample_plan
+from cnpgen.plans.plans import Plans, screen
+from cnpgen.plans.status import PlanStatus
+from cnpgen.store.files import write_file
+
+Form = Literal["npz", "csv", "joint-trajectory"]
+
+FORMS: tuple[Form, ...] = get_args(Form)
+MOST_SAMPLES = 1_000_000  # of one plan
+HIGHEST_RATE = 1e6  # Hz: steps of 1 us, of which ROS stamps can say a thousandth
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What ``export_plans`` did.
+
+    Attributes:
+        files: The files that it wrote, in the order of the plans.
+        count: How many plans are in them.
+        refused: Index of each plan that could not be exported -> why, naming it.
+    """
+
+    files: tuple[Path, ...]
+    count: int
+    refused: dict[int, str]
+
+
+def export_plans(
+    plans: Plans, out: str | Path, *, to: Form, rate: float = 1000.0, only: Sequence[int] | None = None
+) -> Exported:
+    """Sample plans in time and write them; files that are there are replaced.
+
+    * "npz": one file; ``plan_00000_t`` (K,), ``plan_00000_q``, ``_dq``, ``_ddq`` and ``_jerk`` (K, n) of every plan,
+      numbered by its place among ``plans``; ``plan`` and ``sample_id`` (the numbers of those that are there),
+      ``joint_names``.
+    * "csv": one file per plan, ``plan_00000.csv``, with a header of names and units.
+    * "joint-trajectory": one JSON file per plan, ``plan_00000.json``, with the fields of ROS's
+      ``trajectory_msgs/JointTrajectory``.
+
+    Plans that cannot be sampled are left out, and said to be.
+
+    Args:
+        plans: The plans.
+        out: The file to write for "npz" (in a folder that exists: ``plans.npz``), else a folder, which is made.
+        to: The form.
+        rate: Samples per second [Hz]; the last instant of a plan is always one of its samples.
+        only: Indices of the plans to export; all by default.
+
+    Raises:
+        UsageError: An argument makes no sense.
+        DatasetError: None of the plans can be exported.
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    if to not in FORMS:
+        raise UsageError(f"plans can be exported to {', '.join(FORMS)}, got {to!r}")
+    if not 0 < rate <= HIGHEST_RATE:
+        raise UsageError(f"the rate must be above 0 and at most {HIGHEST_RATE:g} Hz, got {rate}")
+    chosen = _chosen(plans, only)
+    out, refused = Path(out), _refused(plans, rate, chosen)
+    kept = [index for index in chosen if index not in refused]
+    if not kept:
+        reasons = "; ".join(list(refused.values())[:3])
+        raise DatasetError(f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}")
+    files = _write_npz(out, plans, rate, kept) if to == "npz" else _write_each(out, plans, rate, kept, to)
+    return Exported(files, len(kept), refused)
+
+
+def _chosen(plans: Plans, only: Sequence[int] | None) -> list[int]:
+    """Return the indices of the plans that are wanted, ascending."""
+    chosen = sorted(set(range(len(plans)) if only is None else only))
+    for index in chosen:
+        if not 0 <= index < len(plans):
+            raise UsageError(f"there is no plan {index}: {len(plans)} plans are numbered from 0")
+    return chosen
+
+
+def _refused(plans: Plans, rate: float, chosen: list[int]) -> dict[int, str]:
+    """Find the plans that cannot be sampled: index -> why."""
+    statuses, found = screen(plans), {}
+    for index in chosen:
+        why = _why_not(plans, index, PlanStatus(statuses[index]), rate)
+        if why:
+            found[index] = f"plan {index} (sample {plans.sample_id[index]}): {why}"
+    return found
+
+
+def _why_not(plans: Plans, index: int, status: PlanStatus, rate: float) -> str:
+    duration = plans.duration[index]
+    if status != PlanStatus.UNKNOWN:
+        return status.text
+    if duration < 1e-9:
+        return f"it lasts {duration:.3g} s, less than a nanosecond"
+    if duration * rate > MOST_SAMPLES:
+        return f"it lasts {duration:.3g} s: more than {MOST_SAMPLES} samples at {rate:g} Hz"
+    if not np.isfinite(plans.motion[[index]].at(np.linspace(0, 1, 101)).jerk).all():
+        return "its derivatives are too large to compute with"
+    return ""
+
+
+def _sampled(plans: Plans, rate: float, kept: list[int]) -> Iterator[tuple[int, Sampled]]:
+    motion = plans.motion
+    for index in kept:
+        yield index, sample_plan(motion[[index]], rate)
+
+
+def _write_npz(out: Path, plans: Plans, rate: float, kept: list[int]) -> tuple[Path, ...]:
+    path = out / "plans.npz" if out.is_dir() else out
+    joints = np.array(plans.problem.joint_names)
+    about = {"plan": np.array(kept), "sample_id": plans.sample_id[kept], "joint_names": joints}
+    write_npz(path, about, _sampled(plans, rate, kept))
+    return (path,)
+
+
+def _write_each(out: Path, plans: Plans, rate: float, kept: list[int], to: Form) -> tuple[Path, ...]:
+    """Write one file per plan."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder")
+    encode, ending = (csv_table, "csv") if to == "csv" else (joint_trajectory, "json")
+    files = []
+    for index, sampled in _sampled(plans, rate, kept):
+        files.append(out / f"plan_{index:05d}.{ending}")
+        write_file(files[-1], encode(sampled, plans.problem.joint_names))
+    return tuple(files)
