@@ -100,17 +100,17 @@ class Constraint(ABC):
     def funnel(
         self, condition: Condition, s: NDArray[np.float64], start_tip: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return how much wider than its bounds a condition is at phases s of a motion, in its unit, shape (K,).
+        """Return how much wider than its bounds a condition is at phases s of motions, in its unit, shape (..., K).
 
         By default nothing; a constraint that motions may begin outside of lets them in here.
 
         Args:
             condition: One of the conditions of ``measured``.
             s: Phases, shape (K,).
-            start_tip: Position of the tip at the start [m], shape (3,).
+            start_tip: Positions of the tip at the start [m], shape (..., 3): of one motion or of many.
         """
-        del condition, start_tip
-        return np.zeros(len(s))
+        del condition
+        return np.zeros((*start_tip.shape[:-1], len(s)))
 
     @abstractmethod
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:

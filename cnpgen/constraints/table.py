@@ -48,9 +48,9 @@ class Table(Constraint):
     ) -> NDArray[np.float64]:
         """Let a motion that starts off the table reach it: all of its height until s = 0.1, nothing from s = 0.3 on."""
         if condition.name != "table height":
-            return np.zeros(len(s))
+            return np.zeros((*start_tip.shape[:-1], len(s)))
         open_: NDArray[np.float64] = np.clip((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0, 1.0)
-        return abs(float(start_tip[2]) - self.z) * open_
+        return np.asarray(np.abs(start_tip[..., 2:] - self.z) * open_)
 
     def _position(self, tip: list[Any], band: float) -> tuple[Condition, ...]:
         low, high = np.array([self.x.low, self.y.low]), np.array([self.x.high, self.y.high])

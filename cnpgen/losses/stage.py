@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 ARGUMENTS: tuple[Axes, ...] = ("point", "point", "point", "point", "lane", "point", "node", "fixed", "fixed")
+WIDER = 5  # which of them is the funnel
 VALUES = Grid(ARGUMENTS, ("lane",))
 GRADIENT = Grid(ARGUMENTS, ("lane", "point", "point", "point", "point"))
 

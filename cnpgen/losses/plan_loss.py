@@ -1,0 +1,178 @@
+"""The loss of plans with its gradient: integrals of the step losses over the phase."""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen import plugins
+from cnpgen.errors import UsageError, nearest
+from cnpgen.kernels.grid import GridKernel
+from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
+from cnpgen.kernels.tape import DTYPES, Dtype
+from cnpgen.losses.funnel import Funnel, make_funnel
+from cnpgen.losses.margins import Margins
+from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch
+from cnpgen.losses.quadrature import Table, basis_table, quadrature
+from cnpgen.losses.stage import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
+from cnpgen.losses.value import LossValue
+from cnpgen.recipes import Problem
+from cnpgen.robots.robot import load_robot
+
+Array = NDArray[Any]
+FORMS = ("signed", "paper")
+
+
+class PlanLoss:
+    """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
+
+    Args:
+        problem: The problem.
+        dtype: "float32" or "float64": what is computed with.
+        nodes: Number of quadrature nodes.
+        rule: Quadrature rule: "cosine" or "gauss".
+        form: "signed": every violation has a gradient; "paper": orientation and collisions as the paper has them.
+        margins: How much tighter than the problem's the bounds are.
+        backend: Which kernels run; by default the fastest that works here.
+        cache_folder: Where kernels are kept; by default where all are.
+
+    Attributes:
+        terms: "time", then the kind of every constraint of the problem: what the columns of ``LossValue.terms`` are.
+        budgets: Acceptable violations from the problem file (the paper's C-bar^2), shape (m,); 0 where it has none.
+        weights0: First weights from the problem file (the paper's e^alpha), shape (m,).
+
+    Raises:
+        UsageError: An argument is none of what it may be.
+        MachineError: The backend that was asked for does not work here.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        dtype: Dtype = "float32",
+        nodes: int = 64,
+        rule: str = "cosine",
+        form: str = "signed",
+        margins: Margins | None = None,
+        backend: Backend | None = None,
+        cache_folder: str | Path | None = None,
+    ) -> None:
+        for name, value, known in (("dtype", dtype, DTYPES), ("form", form, FORMS)):
+            if value not in known:
+                raise UsageError(f"{name} must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}")
+        quadrature(rule, nodes)  # raises for what it does not know
+        self.problem, self.dtype, self.nodes, self.rule, self.form = problem, dtype, nodes, rule, form
+        self.terms = ("time", *_names(problem))
+        self.budgets = np.array([constraint.budget for constraint in problem.constraint])
+        self.weights0 = np.array([constraint.weight for constraint in problem.constraint])
+        self._tightening = (margins or Margins()).tightening(self.terms[1:]).astype(dtype)
+        self._robot = load_robot(problem)
+        chosen, folder = choose_backend(backend)
+        arguments = {"robot": self._robot, "problem": problem}
+        folder = folder if cache_folder is None else Path(cache_folder)
+        self._kernels = KernelLibrary(chosen, folder, problem_identity(problem), arguments)
+
+    def __call__(
+        self,
+        path: ArrayLike,
+        rate: ArrayLike,
+        *,
+        weights: ArrayLike,
+        tops: ArrayLike | None = None,
+        start_tip: ArrayLike | None = None,
+        shift: float = 0.0,
+        gradient: bool = True,
+    ) -> LossValue:
+        """Evaluate N plans.
+
+        Args:
+            path: Path control points [rad], shape (N, C, n).
+            rate: Rate control points [1/s], shape (N, R), positive.
+            weights: Weight of every constraint term (e^alpha), shape (m,).
+            tops: Heights of the obstacles' upper faces [m], shape (N, obstacles); needed where the problem has any.
+            start_tip: Positions of the tip at the start [m], shape (N, 3): motions that start off the table are then
+                given the way to it that ``Constraint.funnel`` says; by default they must be on it at once.
+            shift: Of the quadrature nodes, see ``quadrature``.
+            gradient: Whether gradients are wanted; without, theirs are arrays of no plan, shape (0, C, n) and (0, R).
+
+        Raises:
+            UsageError: A shape is wrong, or a weight is negative or not finite.
+        """
+        batch = check_batch(self.problem, path, rate, tops, start_tip, dtype=self.dtype)
+        scales = self._checked(weights)
+        table = basis_table(self.problem.trajectory, self.rule, self.nodes, shift, self.dtype)
+        n, wanted = len(batch), slice(None) if gradient else slice(0)
+        terms = np.empty((n, len(self.terms)), self.dtype)
+        path_gradient, rate_gradient = np.empty_like(batch.path[wanted]), np.empty_like(batch.rate[wanted])
+        with np.errstate(all="ignore"):  # what overflows is infinite or nan in its own plan
+            for rows in (slice(first, first + BLOCK) for first in range(0, n, BLOCK)):
+                part = batch[rows]
+                results = self._integrate(part, scales, table, gradient=gradient)
+                terms[rows], path_gradient[rows], rate_gradient[rows] = (part.back(values) for values in results)
+            total = terms[:, 0] + terms[:, 1:] @ scales
+        return LossValue(total, terms, path_gradient, rate_gradient)
+
+    def _integrate(
+        self, batch: PlanBatch, weights: Array, table: Table, *, gradient: bool
+    ) -> tuple[Array, Array, Array]:
+        """Return terms and gradients of a block, samples last; those of no plan if they are not wanted."""
+        nodes, (points, n) = len(table.s), batch.path.shape[1:]
+        rates = batch.lanes(batch.rate)
+        lanes = rates.shape[1]
+        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(3, nodes, n, lanes)
+        rate = (table.rate @ rates).reshape(2, nodes, lanes)
+        terms = np.zeros((len(self.terms), lanes), self.dtype)
+        arguments = (
+            *path.swapaxes(1, 2), rate, batch.lanes(batch.tops), self._wider(batch, table, lanes, gradient=gradient),
+            table.weights, self._tightening, weights,
+        )  # fmt: skip
+        if not gradient:
+            self._values(*arguments, out=[terms])
+            return terms, np.empty((points, n, 0), self.dtype), np.empty((len(batch.rate[0]), 0), self.dtype)
+        by_path, by_rate = np.empty_like(path), np.empty_like(rate)
+        self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
+        back = table.path.T @ by_path.reshape(3 * nodes, -1)
+        return terms, back.reshape(points, n, lanes), table.rate.T @ by_rate.reshape(2 * nodes, -1)
+
+    def _wider(self, batch: PlanBatch, table: Table, lanes: int, *, gradient: bool) -> Array:
+        """How much wider than their bounds the conditions with a funnel are, shape (values, K, lanes)."""
+        kernel = self._gradient if gradient else self._values
+        out = np.zeros((kernel.tape.inputs[WIDER], len(table.s), lanes), self.dtype)
+        if batch.start_tip is not None and len(out):
+            out[..., : len(batch)] = self._funnel.width(table.s, batch.start_tip)
+        return out
+
+    def _checked(self, weights: ArrayLike) -> Array:
+        given = np.asarray(weights, float)
+        names = self.terms[1:]
+        if given.shape != (len(names),):
+            raise UsageError(f"weights must have shape ({len(names)},) for {', '.join(names)}, got {given.shape}")
+        for name, weight in zip(names, given.tolist(), strict=True):
+            if not 0 <= weight < np.finfo(self.dtype).max:
+                raise UsageError(f"the weight of {name!r} must be a number that is not negative, got {weight}")
+        return given.astype(self.dtype)
+
+    @cached_property
+    def _gradient(self) -> GridKernel:
+        return self._kernels.load_grid(loss_gradient, GRADIENT, dtype=self.dtype, form=self.form)
+
+    @cached_property
+    def _values(self) -> GridKernel:
+        return self._kernels.load_grid(loss_values, VALUES, dtype=self.dtype, form=self.form)
+
+    @cached_property
+    def _funnel(self) -> Funnel:
+        return make_funnel(self.problem, self._robot, self.form)
+
+
+def _names(problem: Problem) -> list[str]:
+    """Name the constraint terms by their kinds; the second of a kind is called kind-2, and so on."""
+    names: list[str] = []
+    for constraint in problem.constraint:
+        kind = plugins.name_of(plugins.CONSTRAINTS, type(constraint))
+        count = 1 + sum(type(other) is type(constraint) for other in problem.constraint[: len(names)])
+        names.append(kind if count == 1 else f"{kind}-{count}")
+    return names

@@ -1,0 +1,87 @@
+"""Where the integrals over the phase are sampled: rules that see what clamped splines do at the ends.
+
+The first and last basis functions of r are about 0.01 wide. Between uniform nodes a plan can hide an acceleration of a
+hundred times the limit there, and training finds it. The nodes of Gauss, and those of the midpoint rule in the angle of
+``s = (1 - cos theta) / 2``, are dense at the ends: 64 of them are as accurate as 1024 uniform ones.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError, nearest
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.spline import basis
+
+Array = NDArray[np.float64]
+RULES = ("cosine", "gauss")
+
+
+def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]:
+    """Return nodes and weights on [0, 1].
+
+    Args:
+        rule: "cosine": the midpoint rule in theta; "gauss": Gauss-Legendre.
+        nodes: Number of nodes K.
+        shift: By which fraction of their distance the nodes of the cosine rule are moved on, in [0, 1). Averaged over
+            shifts there is nothing between nodes.
+
+    Returns:
+        ``(s, weights)``, shape (K,) each; the weights sum to 1.
+
+    Raises:
+        UsageError: There is no such rule, no node, or the shift is not in [0, 1).
+    """
+    if rule not in RULES:
+        reason = "; between uniform nodes the ends of r hide violations" if rule == "uniform" else nearest(rule, RULES)
+        raise UsageError(f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}")
+    if nodes < 1:
+        raise UsageError(f"the number of quadrature nodes must be at least 1, got {nodes}")
+    if not 0 <= shift < 1 or (rule == "gauss" and shift != 0):
+        expected = "0, Gauss nodes cannot be moved" if rule == "gauss" else "in [0, 1)"
+        raise UsageError(f"the shift of the quadrature nodes must be {expected}, got {shift}")
+    if rule == "gauss":
+        x, weights = np.polynomial.legendre.leggauss(nodes)
+        return (1 + x) / 2, weights / 2
+    theta = np.pi * (np.arange(nodes) + (0.5 + shift) % 1) / nodes
+    weights = np.sin(theta)
+    return (1 - np.cos(theta)) / 2, weights / weights.sum()
+
+
+def rotating_shift(step: int, count: int = 8) -> float:
+    """Return the shift of a training step: ``count`` equally spaced ones in turn, none of which puts a node on an end.
+
+    Args:
+        step: Which step.
+        count: How many shifts; 1 leaves the nodes where they are.
+    """
+    return ((step % count + 0.5) / count + 0.5) % 1
+
+
+@dataclass(frozen=True)
+class Table:
+    """The basis functions at the nodes.
+
+    Attributes:
+        s: Phases, shape (K,), float64.
+        weights: Quadrature weights, shape (1, K).
+        path: Those of p, p' and p'', shape (3 K, C).
+        rate: Those of r and r', shape (2 K, R).
+    """
+
+    s: Array
+    weights: NDArray[Any]
+    path: NDArray[Any]
+    rate: NDArray[Any]
+
+
+@lru_cache(maxsize=64)
+def basis_table(spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str) -> Table:
+    """Tabulate the basis of both splines at the nodes of ``quadrature``."""
+    s, weights = quadrature(rule, nodes, shift)
+    path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(3)]
+    rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)]
+    return Table(s, weights[None].astype(dtype), np.vstack(path).astype(dtype), np.vstack(rate).astype(dtype))
