@@ -33,6 +33,12 @@ class RecipeError(CnpgenError):
         return "\n".join(self.mistakes)
 
 
+class PluginError(RecipeError):
+    """A recipe needs stages or constraints of packages that are not installed here."""
+
+    exit_code = 3
+
+
 class DatasetError(CnpgenError):
     """A dataset on disk that is damaged, unfinished or not what was asked for."""
 

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 from cnpgen import plugins
 from cnpgen.constraints.constraint import Constraint
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import PluginError, RecipeError, nearest
 from cnpgen.pipelines.stage import Stage
 from cnpgen.recipes import DatasetRecipe, Pipeline, Problem
 from cnpgen.schema import Place, Reader, parse
@@ -85,9 +85,12 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
         folder: Where the URDF file is written to.
 
     Raises:
-        RecipeError: The content does not fit this version of cnpgen, or a plug-in that it needs is not installed.
+        RecipeError: The content does not fit this version of cnpgen.
+        PluginError: A package that it needs is not installed.
     """
     path, mistakes = folder / "recipe.toml", list[str]()
+    if missing := _missing_plugins(content):
+        raise PluginError(missing)
     content = _without_defaults(content)
     problem_table = content["pipeline"]["problem"]
     problem_table["robot"]["urdf"] = "robot.urdf"
@@ -110,12 +113,22 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     return replace(made, path=path)
 
 
+def _missing_plugins(content: dict[str, Any]) -> list[str]:
+    """Say which packages a resolved recipe needs that are not installed."""
+    pipeline = content["pipeline"]
+    tables = [(plugins.STAGES, table) for _, table in _tables(pipeline, "stage")]
+    tables += [(plugins.CONSTRAINTS, table) for _, table in _tables(pipeline["problem"], "constraint")]
+    found = (plugins.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for group, each in tables)
+    return list(dict.fromkeys(text for text in found if text))
+
+
 def _without_defaults(value: Any) -> Any:
-    """Leave out nulls, empty arrays and digests of plug-ins: in a recipe they are not said."""
+    """Leave out nulls, empty arrays and what is noted of plug-ins: in a recipe they are not said."""
     if isinstance(value, dict):
         said = {key: entry for key, entry in value.items() if entry is not None and entry != []}
         if "use" in said:
             said.pop("source", None)
+            said.pop("package", None)
         return {key: _without_defaults(entry) for key, entry in said.items()}
     return [_without_defaults(entry) for entry in value] if isinstance(value, list) else value
 

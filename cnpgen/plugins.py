@@ -118,6 +118,32 @@ def source_digest(kind: type) -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
+def package_of(group: str, kind: type) -> str:
+    """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
+    name = name_of(group, kind)
+    found = [entry.dist.name for entry in installed(group) if entry.name == name and entry.dist]
+    return found[0] if found else ""
+
+
+def why_missing(group: str, use: str, package: str) -> str:
+    """Say which package to install for a kind that a recipe of somebody else names; empty if the kind is there.
+
+    Args:
+        group: ``STAGES`` or ``CONSTRAINTS``.
+        use: Name of the kind.
+        package: The package that had it, empty if that is not known.
+    """
+    if use in names(group):
+        return ""
+    noun = BASES[group].__name__.lower()
+    if not package:
+        return f"{noun} {use!r} is not installed: install the package that registers it (entry point group {group!r})"
+    return (
+        f"{noun} {use!r} comes from the package {package!r}, which is not installed:"
+        f" run 'pip install {package}', or install it from its source"
+    )
+
+
 @functools.cache
 def installed(group: str) -> tuple[importlib.metadata.EntryPoint, ...]:
     """List the entry points of installed packages; reading their metadata takes milliseconds, so it is done once."""

@@ -237,9 +237,11 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
 
 
 def _use(obj: object) -> dict[str, str]:
-    """Label a stage or a constraint with the name of its kind and, for a plug-in, the digest of its code."""
+    """Label a stage or a constraint with the name of its kind and, for a plug-in, its package and code."""
     for group, base in plugins.BASES.items():
         if isinstance(obj, base):
             source = plugins.source_digest(type(obj))
-            return {"use": plugins.name_of(group, type(obj)), **({"source": source} if source else {})}
+            package = plugins.package_of(group, type(obj))
+            about = {"package": package, "source": source}
+            return {"use": plugins.name_of(group, type(obj)), **{key: text for key, text in about.items() if text}}
     return {}

@@ -36,12 +36,12 @@ def environment(folder: Path) -> dict[str, str]:
     }
 
 
-def run(command: list[str], folder: Path) -> str:
+def run(command: list[str], folder: Path, code: int = 0) -> str:
     done = subprocess.run(
         command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=600, check=False
     )
-    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout if code == 0 else done.stderr
 
 
 def test_every_block_says_what_it_is() -> None:
@@ -91,6 +91,12 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     rejected = run(["cnpgen", "inspect", "slow"], tmp_path)
     assert "hit too fast" in rejected
     assert "in the circle" in rejected
+
+    (source / "my_hockey-1.0.dist-info" / "entry_points.txt").unlink()  # as if it were not installed
+    run(["cnpgen", "validate", "slow"], tmp_path)
+    lost = run(["cnpgen", "validate", "slow", "--deep"], tmp_path, code=3)
+    assert "stage 'slow-hits' comes from the package 'my-hockey', which is not installed" in lost
+    assert "constraint 'keep-out' comes from the package 'my-hockey', which is not installed" in lost
 
 
 def install(folder: Path, project: dict[str, object]) -> None:

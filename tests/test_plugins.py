@@ -134,6 +134,16 @@ def test_two_plug_ins_with_one_name_are_an_error(register):
         load(STAGES, "toss")
 
 
+def test_who_lacks_a_plug_in_is_told_which_package_to_install(register):
+    assert plugins.why_missing(STAGES, "roll", "") == ""
+    text = plugins.why_missing(STAGES, "toss", "dice-stages")
+    assert "stage 'toss' comes from the package 'dice-stages', which is not installed" in text
+    assert "pip install dice-stages" in text
+    assert "entry point group 'cnpgen.constraints'" in plugins.why_missing(CONSTRAINTS, "toss", "")
+    register(STAGES, "toss", f"{__name__}:Toss")
+    assert plugins.why_missing(STAGES, "toss", "dice-stages") == ""
+
+
 def test_name_of_is_the_inverse_of_load(register):
     register(STAGES, "broken", f"{__name__}:Missing")
     register(STAGES, "toss", f"{__name__}:Toss")
