@@ -253,7 +253,9 @@ def _check_backend(found: _Findings, cache: str) -> tuple[str, str, bool]:
     found.notes += [str(warning.message) for warning in caught]
     if str(folder) != cache:
         shutil.rmtree(folder, ignore_errors=True)  # it was made for this look only
-    reason = "a test kernel was compiled and computes what it should" if backend == "compiled" else "no compiler works"
+    reason = (
+        "a test kernel was compiled and computes what it should" if backend == "compiled" else "no C compiler works"
+    )
     return backend, reason, str(folder) == cache
 
 

@@ -446,12 +446,15 @@ def test_inspect_of_something_else_is_one_line(run, tmp_path):
 
 def test_validate_says_yes(run, hits):
     code, out, err = run("validate", hits, "--deep", "--workers", "1", "--regenerate", "1")
-    assert (code, out) == (0, "")
-    assert "no findings" in err
+    assert code == 0
+    assert "no findings" in out
+    assert "recomputed with Pinocchio and Coal: 200 rows, 0 out" in out
+    assert err == f"validating {hits}: 200 rows\n"
 
 
 def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):
-    findings = (Finding("train/shard-00000.h5", "is missing"), Finding("plan.json", "was\nchanged"))
+    notes = (Finding("mine.txt", "is not part of the dataset", note=True),)
+    findings = (Finding("train/shard-00000.h5", "is missing"), Finding("plan.json", "was\nchanged"), *notes)
     wanted = {}
 
     def validate(folder, **options):
@@ -461,8 +464,9 @@ def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):
     monkeypatch.setattr("cnpgen.validation.validate_dataset", validate)
     code, out, err = run("validate", hits, "--regenerate", "3")
     assert code == 1
-    assert out == "train/shard-00000.h5: is missing\nplan.json: was changed\n"
-    assert "2 findings" in err
+    lines = ["train/shard-00000.h5: is missing", "plan.json: was changed", "note: mine.txt: is not part of the dataset"]
+    assert out.splitlines() == [*lines, f"{hits}: 18 rows, 2 findings"]
+    assert err == ""
     assert wanted["regenerate"] == 3
     code, out, _ = run("validate", hits, "--json")
     assert code == 1
@@ -480,7 +484,7 @@ def test_doctor_is_3_with_a_line_per_problem(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "pinocchio", types.ModuleType("pinocchio"))
     code, out, err = run("doctor")
     assert code == 3
-    assert "1 problems" in out
+    assert "1 problem, below" in out
     assert "another project" in one_line(err)
 
 

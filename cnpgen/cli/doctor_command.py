@@ -8,13 +8,21 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.errors import MachineError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from cnpgen.doctor import MachineReport
+
+
+_TEXT = """\
+What was found is on stdout, warnings and problems on stderr, each with what to do about it. The exit code is 3 if
+something that cnpgen needs does not work; without a C compiler it works, 10 to 20 times slower.
+"""
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     title = "check that this machine has what cnpgen needs"
-    add_json(add_command(commands, "doctor", run, title=title))
+    add_json(add_command(commands, "doctor", run, title=title, text=_TEXT))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -49,9 +57,20 @@ def machine_text(report: "MachineReport") -> str:
         "cache": f"{report.cache_folder} ({'writable' if report.cache_writable else 'not writable'})",
         "recipes": report.recipes,
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
-        "verdict": "everything that cnpgen needs works" if report.ok else f"{len(report.problems)} problems",
+        "verdict": _verdict(report),
     }
     return "\n".join(f"{name:<10} {_folded(value)}" for name, value in facts.items())
+
+
+def _verdict(report: "MachineReport") -> str:
+    if not report.ok:
+        return f"cnpgen does not work here: {_counted(report.problems, 'problem')}, below"
+    text = "everything that cnpgen needs works"
+    return f"{text}; {_counted(report.notes, 'warning')}, below" if report.notes else text
+
+
+def _counted(things: "Sequence[str]", noun: str) -> str:
+    return f"{len(things)} {noun}" if len(things) == 1 else f"{len(things)} {noun}s"
 
 
 def _folded(text: str) -> str:

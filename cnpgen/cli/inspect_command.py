@@ -15,9 +15,17 @@ if TYPE_CHECKING:
     from cnpgen.store.statistics import FieldStatistics
 
 
+_TEXT = """\
+It reads the plan and the records of the shards, not the rows, so that it is as quick for large datasets, and works for
+unfinished ones; whether the rows are what the records say is for 'cnpgen validate' to tell. Of the draws, "accepts" is
+the share that passes a condition of those that got there, "left" the share that is still alive after it of all of them.
+"""
+
+
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "inspect", run, title="show what a dataset holds and how it came about")
+    title = "show what a dataset holds and how it came about"
+    parser = add_command(commands, "inspect", run, title=title, text=_TEXT)
     parser.add_argument("folder", metavar="DIR", type=Path, help="folder of a dataset, finished or not")
     parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="draw it, too: .png, .pdf or .svg")
     add_json(parser)

@@ -15,12 +15,22 @@ if TYPE_CHECKING:
 KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
 
 
+_TEXT = """\
+A dataset is shown with its pipeline and its problem, a pipeline with its problem. A file that has mistakes is not
+shown: every mistake is a line on stderr, with file and key, and the exit code is 2.
+"""
+
+
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "show", run, title="describe a recipe, or a kind of stage or constraint")
+    title = "describe a recipe, or a kind of stage or constraint"
+    parser = add_command(commands, "show", run, title=title, text=_TEXT)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
-        "recipe", metavar="NAME|FILE", nargs="?", help="a shipped dataset, pipeline or problem, or a file"
+        "recipe",
+        metavar="NAME|FILE",
+        nargs="?",
+        help="a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file",
     )
     what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
     what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")

@@ -85,6 +85,19 @@ def find_compiler() -> str | None:
     return next((path for path in map(shutil.which, candidates) if path), None)
 
 
+def require_compiler() -> str:
+    """Return the path of the C compiler.
+
+    Raises:
+        MachineError: There is none.
+    """
+    if compiler := find_compiler():
+        return compiler
+    if wanted := os.environ.get("CC"):
+        raise MachineError(f"no C compiler found: CC is {wanted!r}, which is no program here")
+    raise MachineError("no C compiler found (looked for cc, gcc, clang)")
+
+
 @cache
 def compiler_version(compiler: str) -> str:
     """Return the first line of ``compiler --version``.
@@ -144,19 +157,30 @@ def _content_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:24]
 
 
+def find_compiled(tape: Tape, cache_folder: Path) -> Path | None:
+    """Return the library of a tape if it is in the cache.
+
+    Raises:
+        MachineError: There is no working compiler or the cache folder cannot be read.
+    """
+    libraries = cache_folder / "lib"
+    try:
+        return find_library(libraries, library_stem(tape, require_compiler()))
+    except OSError as error:
+        raise MachineError(f"cannot use the kernel cache {libraries}: {error.strerror or error}") from error
+
+
 def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     """Return the library of a tape, compiling it if it is not in the cache or damaged there.
 
     Raises:
         MachineError: There is no working compiler or the cache folder cannot be written.
     """
-    compiler = find_compiler()
-    if compiler is None:
-        raise MachineError("no C compiler found (looked for $CC, cc, gcc, clang)")
+    if found := find_compiled(tape, cache_folder):
+        return found
+    compiler = require_compiler()
     libraries, stem = cache_folder / "lib", library_stem(tape, compiler)
     try:
-        if found := find_library(libraries, stem):
-            return found
         _LOG.info("compiling kernels, once per machine")
         libraries.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:

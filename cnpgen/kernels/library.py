@@ -5,7 +5,8 @@ import inspect
 import json
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,17 +16,19 @@ import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.cache import default_cache_folder, writable_folder
-from cnpgen.kernels.compiled import CompiledGridKernel, CompiledKernel, compile_tape, find_compiler
+from cnpgen.kernels.compiled import CompiledGridKernel, CompiledKernel, compile_tape, require_compiler
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
 from cnpgen.kernels.tape import CODES, Dtype, Grid, Loop, Tape, tape_from_function
+from cnpgen.kernels.together import Compilers
 from cnpgen.recipes import Problem, resolved
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 SLOWER = "10 to 20 times slower than compiled code"  # benchmarks/generator.py measures it: 9 to 24
+REMEDY = "install gcc or clang ('cnpgen doctor' checks it)"
 
 
 @dataclass
@@ -43,6 +46,7 @@ class KernelLibrary:
     cache_folder: Path
     identity: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    _compilers: Compilers | None = field(default=None, init=False, repr=False)
 
     def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
         """Return the kernel of the SX function that ``builder`` builds.
@@ -60,7 +64,23 @@ class KernelLibrary:
         tape = self._tape(builder, given, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
+        if self._compilers is not None:
+            return self._compilers.kernel(tape)
         return CompiledKernel(tape, compile_tape(tape, self.cache_folder))
+
+    @contextmanager
+    def compiling_together(self) -> Iterator[None]:
+        """Compile what is loaded inside side by side; afterwards all of it is there.
+
+        Raises:
+            MachineError: A compiler failed.
+        """
+        with Compilers(self.cache_folder) as compilers:
+            self._compilers = compilers
+            try:
+                yield
+            finally:
+                self._compilers = None
 
     def load_grid(self, builder: Callable[..., Any], grid: Grid, *, dtype: Dtype, **parameters: Any) -> GridKernel:
         """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
@@ -176,15 +196,15 @@ def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     except MachineError as error:
         if wanted == "compiled":
             raise
-        warnings.warn(f"{error}; running on the NumPy backend, {SLOWER}", RuntimeWarning, stacklevel=2)
+        text = f"{error}: running on the NumPy backend, {SLOWER}; {REMEDY}"
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
         return "numpy", folder
     return "compiled", folder
 
 
 def _try_compiler(folder: Path) -> None:
     """Compile, load and run the smallest kernel; raise MachineError where that does not work."""
-    if find_compiler() is None:
-        raise MachineError("no C compiler found (looked for $CC, cc, gcc, clang)")
+    require_compiler()
     codes = np.array([CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]], np.int16)
     operands = np.array([0, 0, 1], np.int32)
     tape = Tape("selftest", (1,), (1,), codes, operands, np.zeros(3, np.int32), np.zeros(3))

@@ -72,8 +72,9 @@ class PreparedPipeline:
         self.context = Context(problem, robot, kernels, dtype)
         self.fields = _ordered_fields(pipeline, self.context)
         written = _check_needs(pipeline, self.context)
-        self._stages = _prepare(pipeline, self.context)
-        self._accept = acceptance(self.context, written)
+        with kernels.compiling_together():
+            self._stages = _prepare(pipeline, self.context)
+            self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int = BLOCK_ROWS) -> Block:
         """Make rows ``first`` to ``stop`` of one block.
