@@ -4,9 +4,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.cut import Cut
+from cnpgen.loader.columns import tail
+from cnpgen.loader.cut import Cut, integer
 from cnpgen.loader.form import Form
 from cnpgen.loader.order import Order
 from cnpgen.loader.position import Position, position_from_json, position_to_json
@@ -46,6 +49,15 @@ class Batches:
     def epoch(self, epoch: int) -> None:
         self._position = replace(self._position, epoch=epoch, row=0)
 
+    @property
+    def signature(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+        """Field name -> shape of its value in one row, and its type."""
+        integer_type, form = np.dtype(np.int64), self._form
+        return {
+            field.name: (tail(field), form.dtype if field.name in form.layout.slices else integer_type)
+            for field in form.layout.fields
+        }
+
     def __len__(self) -> int:
         """Return the number of batches in a whole epoch."""
         return self._cut.count(self._source.rows)
@@ -72,9 +84,27 @@ class Batches:
                 )
         self._position = replace(position, epoch=position.epoch + 1, row=0)
 
-    def state(self) -> dict[str, Any]:
-        """Say where it is, as a small JSON-able dict, the same on every rank; batches handed out are behind it."""
-        return position_to_json(self._position, self._source)
+    def state(self, *, epoch: int | None = None, batch: int | None = None) -> dict[str, Any]:
+        """Say where it is, as a small JSON-able dict, the same on every rank.
+
+        By default that is after the last batch handed out. Where something takes batches ahead of their use (workers,
+        a prefetch), the user alone knows how many were used:
+
+        Args:
+            epoch: The epoch; this one by default.
+            batch: How many batches of that epoch were used.
+
+        Raises:
+            UsageError: The epoch has not so many batches.
+        """
+        position = self._position
+        if epoch is not None or batch is not None:
+            used = integer("batch", batch or 0, least=0)
+            if used > len(self):
+                raise UsageError(f"an epoch has {len(self)} batches, {used} cannot have been used")
+            row = min(used * self._cut.batch_size, self._source.rows)
+            position = replace(position, epoch=position.epoch if epoch is None else epoch, row=row)
+        return position_to_json(position, self._source)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go to where ``state()`` was called: the next loop begins with the batch after it and reads none before.
