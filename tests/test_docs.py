@@ -8,8 +8,15 @@ import sys
 import tomllib
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+
+from cnpgen.library import load_problem
+from cnpgen.robots.robot import load_robot
+from cnpgen.verify.path import PathWorld
+from cnpgen.verify.world import World
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -100,6 +107,25 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     lost = run(["cnpgen", "validate", "slow", "--deep"], tmp_path, code=3)
     assert "stage 'slow-hits' comes from the package 'my-hockey', which is not installed" in lost
     assert "constraint 'keep-out' comes from the package 'my-hockey', which is not installed" in lost
+
+
+def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states() -> None:
+    files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
+    module: dict[str, Any] = {"__name__": "my_hockey"}
+    exec(compile(files["src/my_hockey.py"], "my_hockey.py", "exec"), module)
+    keep_out = module["KeepOut"](x=1.0, y=0.0, radius=0.1, tolerance=1e-3)
+    problem = load_problem("airhockey")
+    robot = load_robot(problem)
+    q = np.linspace(robot.base, 0.5 * robot.base, 20).T
+    path, world, still = PathWorld(problem, robot), World(problem, robot), np.zeros((robot.n, 20))
+    path.set_path(q, still, still, np.zeros(0))
+    (along,) = keep_out.measured(path)
+    single = []
+    for state in q.T.copy():
+        world.set_state(state, still[:, 0], still[:, 0], np.zeros(0))
+        single.append(keep_out.measured(world)[0].g[0])
+    np.testing.assert_allclose(along.g[0], single, rtol=1e-12)
+    assert np.ptp(single) > 0.01
 
 
 def install(folder: Path, project: dict[str, object]) -> None:

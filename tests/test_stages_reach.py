@@ -100,7 +100,7 @@ def test_a_stage_that_needs_what_no_stage_wrote_is_a_mistake_in_the_recipe(prepa
     with pytest.raises(RecipeError) as caught:
         prepare(replace(pipeline, stage=(BallisticReach(start_time=0.02), *pipeline.stage[:2])))
     text = str(caught.value)
-    assert "stage 1 (BallisticReach) needs start_xyz, start_tip_velocity, which no stage before it writes" in text
+    assert "stage 1 (ballistic-reach): needs start_xyz, start_tip_velocity, which no stage before it writes" in text
     assert "no stage writes goal_q, which every sample must have" in text
 
 

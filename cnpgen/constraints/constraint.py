@@ -83,8 +83,14 @@ class Constraint(ABC):
     A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]`` table in ``problem.toml``; it is
     registered under a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.constraints``.
 
+    ``tolerance`` has another unit in every kind (of the condition, or a fraction of a limit), so a kind declares it
+    again with ``cnpgen.schema.field``.
+
     Attributes:
         reason: The name under which a sample that breaks the constraint is counted.
+        tolerance: How far a motion may be outside the condition and still be called valid.
+        budget: Acceptable violation while training.
+        weight: First weight of the violation while training.
     """
 
     reason: ClassVar[str]
@@ -125,12 +131,19 @@ class Constraint(ABC):
 
     @abstractmethod
     def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Evaluate the same condition with Pinocchio and Coal at the state that ``world`` holds."""
+        """Evaluate the same condition with Pinocchio and Coal at the state, or at the K states, that ``world`` holds.
+
+        It is written for one state, and is also given a ``cnpgen.verify.path.PathWorld``, whose arrays have a trailing
+        axis of K states: ``world.q`` of shape (n, K), ``world.tip_position`` (3, K), distances (K,). So it counts
+        indices from the front and uses elementwise operations only: no ``if`` on a value, no ``float()``, ``max()`` or
+        ``sum()`` over a vector. Every entry of a condition's ``g`` is then a float or an array of shape (K,); bounds do
+        not depend on the state.
+        """
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State what a boundary state must meet; by default what every state must."""
         return self.symbolic(state)
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
-        """Evaluate what a boundary state must meet, with Pinocchio and Coal."""
+        """Evaluate what a boundary state must meet, with Pinocchio and Coal; ``world`` holds one state."""
         return self.measured(world)

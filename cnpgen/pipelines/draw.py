@@ -78,4 +78,4 @@ def uniform(numbers: Array, ranges: tuple[Range, ...]) -> Array:
 
 
 def _box(ranges: tuple[Range, ...]) -> str:
-    return " x ".join(f"[{r.low:g}, {r.high:g}]" if r.low < r.high else f"{{{r.low:g}}}" for r in ranges)
+    return " x ".join(f"[{r.low:g}, {r.high:g}]" if r.low < r.high else f"{r.low:g}" for r in ranges)

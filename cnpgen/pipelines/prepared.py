@@ -125,10 +125,9 @@ class PreparedPipeline:
         if tried >= FAIR_CHANCE and made < HOPELESS * tried:
             counts = np.bincount(batch.fate, minlength=1 + len(batch.reasons))[1:]
             worst = sorted(zip(counts.tolist(), batch.reasons, strict=True), reverse=True)[:3]
-            reasons = ", ".join(f"{reason} ({count / batch.size:.0%})" for count, reason in worst)
-            raise RecipeError(
-                [f"{self.pipeline.path}: {made} of {tried} draws were accepted; rejected mostly for: {reasons}"]
-            )
+            reasons = ", ".join(f"{reason} ({count / batch.size:.1%})" for count, reason in worst if count)
+            text = f"{made} of {tried:,} draws were accepted; of the last {batch.size:,}, rejected for {reasons}"
+            raise RecipeError([f"{self.pipeline.path}: {text}"])
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:
@@ -173,12 +172,12 @@ def _round_size(made: int, tried: int) -> int:
 def _prepare(pipeline: Pipeline, context: Context) -> list[tuple[str, Run]]:
     """Prepare and label every stage; raise all their mistakes at once, each with file and stage."""
     runs, mistakes = [], []
-    for index, stage in enumerate(pipeline.stage):
+    for number, stage in enumerate(pipeline.stage, start=1):
+        kind = plugins.name_of(plugins.STAGES, type(stage))
         try:
-            label = f"{index + 1}. {plugins.name_of(plugins.STAGES, type(stage))}"
-            runs.append((label, stage.prepare(context)))
+            runs.append((f"{number}. {kind}", stage.prepare(context)))
         except RecipeError as error:
-            mistakes += [f"{pipeline.path}: stage[{index}]: {mistake}" for mistake in error.mistakes]
+            mistakes += [f"{pipeline.path}: stage {number} ({kind}): {mistake}" for mistake in error.mistakes]
     if mistakes:
         raise RecipeError(mistakes)
     return runs
@@ -201,10 +200,9 @@ def _check_needs(pipeline: Pipeline, context: Context) -> set[str]:
     for number, stage in enumerate(pipeline.stage, start=1):
         missing = [name for name in stage.needs if name not in written]
         if missing:
-            mistakes.append(
-                f"{pipeline.path}: stage {number} ({type(stage).__name__}) needs {', '.join(missing)},"
-                " which no stage before it writes"
-            )
+            kind = plugins.name_of(plugins.STAGES, type(stage))
+            text = f"needs {', '.join(missing)}, which no stage before it writes"
+            mistakes.append(f"{pipeline.path}: stage {number} ({kind}): {text}")
         written.update(stage.writes(context))
     needed = ("start_q", "start_dq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
     mistakes.extend(
