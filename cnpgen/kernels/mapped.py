@@ -45,15 +45,14 @@ class MappedGridKernel(GridKernel):
     def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
         """Evaluate the grid; see ``GridKernel``."""
         nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
-        everywhere = [
-            np.broadcast_to(_spread(argument, axis_names(axes)), (len(argument), nodes, lanes)).reshape(
-                len(argument), -1
-            )
-            for argument, axes in zip(arguments, self.grid.arguments, strict=True)
-        ]
+        everywhere = []
+        for argument, axes in zip(arguments, self.grid.arguments, strict=True):
+            shape = (len(argument), nodes, lanes)
+            spread = np.broadcast_to(_spread(argument, axis_names(axes)), shape)
+            everywhere.append(spread.reshape(len(argument), nodes * lanes))
         found = _map(self._function, everywhere, nodes * lanes, self.tape.outputs)
         for result, values, axes in zip(out, found, self.grid.results, strict=True):
-            grid = values.reshape(-1, nodes, lanes)
+            grid = values.reshape(len(values), nodes, lanes)
             result[...] = grid if axes == "point" else result + grid.sum(axis=1)
 
 

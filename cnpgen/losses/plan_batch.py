@@ -84,7 +84,7 @@ def check_batch(
     tips = None if start_tip is None else _array("start_tip", start_tip, (len(control), 3), "float64")
     good = (rates > 0).all(axis=1)
     for array in (control, rates, heights, *([] if tips is None else [tips])):
-        good &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+        good &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     return PlanBatch(control, rates, heights, tips, np.asarray(good))
 
 

@@ -88,7 +88,7 @@ BOUNDED = MetricSettings(
 )
 
 
-def suggested_weights(names: Sequence[str], weights0: ArrayLike) -> Array:
+def suggested_weights(names: Sequence[str], weights0: ArrayLike) -> NDArray[np.float64]:
     """Return weights to begin with: those that work for the known kinds, 100 times the problem file's for others.
 
     Args:
