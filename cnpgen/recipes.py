@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -228,10 +228,20 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
         sha256, as 64 hexadecimal digits.
     """
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
-    content = resolved(pipeline)
-    problem, urdf = content["problem"], pipeline.problem.urdf_path.read_bytes()
-    del content["title"], problem["title"], problem["robot"]["urdf"]
-    content["urdf_sha256"] = hashlib.sha256(urdf).hexdigest()
+    return resolved_digest(resolved(pipeline), pipeline.problem.urdf_path.read_bytes())
+
+
+def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
+    """Hash a pipeline that was resolved, here or, as plans of datasets keep it, elsewhere; see ``recipe_digest``.
+
+    Args:
+        pipeline: What ``resolved`` made of it.
+        urdf: Content of the robot's URDF file.
+    """
+    problem = {key: value for key, value in pipeline["problem"].items() if key != "title"}
+    problem["robot"] = {key: value for key, value in problem["robot"].items() if key != "urdf"}
+    content = {key: value for key, value in pipeline.items() if key != "title"}
+    content |= {"problem": problem, "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.consistency import check_recipe, check_statistics
 from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import restore_dataset_recipe
@@ -18,6 +19,7 @@ from cnpgen.make_shard import shard_columns, versions
 from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
 from cnpgen.recipes import DatasetRecipe
 from cnpgen.robots.robot import load_robot
+from cnpgen.shard_checks import check_numbers
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.reader import StoredDataset
@@ -125,7 +127,9 @@ def validate_dataset(
     present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
     whole = [task for task in present if task.file not in wrong]
     report, made, identical = None, 0, 0
+    findings += check_recipe(plan)
     if deep:
+        findings += check_statistics(folder, plan)
         report, found = _deep(folder, plan, whole, worker_count(workers, len(whole)), progress)
         findings += found
     if regenerate:
@@ -175,21 +179,18 @@ def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardChe
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
         columns = read_shard(folder / task.file)
-        tried = load_record(folder, task).outcome.tried
+        record = load_record(folder, task)
     except CnpgenError as error:
         return _ShardCheck(None, [str(error)], np.empty(0, np.uint64))
     with restored(plan) as recipe:
         problem = recipe.pipeline.problem
         report = verify_rows(problem, load_robot(problem), columns, dtype=plan.dtype)
-    problems = [
+    problems = check_numbers(plan, task, columns, record)
+    problems += [
         f"{check.name}: {check.rows_out} rows out, worst {check.worst:.3g} {check.unit}"
         f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}"
         for check in report.failed
     ]
-    if not np.array_equal(columns["sample_id"], task.first_row + np.arange(task.rows)):
-        problems.append("sample_id does not count the rows of the split")
-    if int(columns["attempts"].sum()) != tried:
-        problems.append(f"attempts sum to {columns['attempts'].sum()}, but {tried} draws are recorded")
     ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
     bits = np.ascontiguousarray(np.concatenate(ends, axis=1), np.float64).view(np.uint64)
     keys = (bits * np.resize(_ODD, bits.shape[1])).sum(axis=1, dtype=np.uint64)

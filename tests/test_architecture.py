@@ -23,7 +23,7 @@ LAYERS = (
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
     ("interop",),
-    ("make_shard", "make", "validation", "inspection", "describe", "plots", "doctor"),
+    ("make_shard", "make", "validation", "consistency", "shard_checks", "inspection", "describe", "plots", "doctor"),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.

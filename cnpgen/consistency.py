@@ -1,0 +1,32 @@
+"""Whether the documents of a dataset agree with each other, beyond what their checksums tell."""
+
+from pathlib import Path
+
+from cnpgen.errors import DatasetError
+from cnpgen.recipes import resolved_digest
+from cnpgen.store.check import Finding
+from cnpgen.store.documents import load_document, plain
+from cnpgen.store.layout import PLAN, STATS
+from cnpgen.store.plan import DatasetPlan
+from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
+
+
+def check_recipe(plan: DatasetPlan) -> list[Finding]:
+    """Check that the digest of the recipe in a plan is that of the recipe in it."""
+    try:
+        found = resolved_digest(plan.recipe["pipeline"], str(plan.robot["urdf"]).encode())
+    except (KeyError, TypeError, AttributeError):
+        return [Finding(PLAN, "has no recipe that can be read")]
+    same = found == plan.recipe_sha256
+    return [] if same else [Finding(PLAN, f"its recipe has the sha256 {found}, not the recorded {plan.recipe_sha256}")]
+
+
+def check_statistics(folder: Path, plan: DatasetPlan) -> list[Finding]:
+    """Check that ``stats.json`` sums up the records of the shards, all of which must be there."""
+    try:
+        document = load_document(folder / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+        expected = plain(stats_document(summarise(folder, plan)))
+    except DatasetError:  # missing or damaged: found already
+        return []
+    wrong = [key for key in expected if document.get(key) != expected[key]]
+    return [Finding(STATS, f"does not sum up the shards' records: {', '.join(wrong)} differ")] if wrong else []
