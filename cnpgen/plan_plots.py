@@ -28,7 +28,16 @@ SHOWN = 7  # moments at which the arm and the object are drawn
 _START, _BETWEEN, _GOAL, _LIMIT, _BOX = "tab:blue", "0.55", "tab:red", "0.25", "0.85"
 
 
-def plot_plan(problem: Problem, robot: Robot, motion: Motion, index: int, path: str | Path) -> None:
+def plot_plan(
+    problem: Problem,
+    robot: Robot,
+    motion: Motion,
+    index: int,
+    path: str | Path,
+    *,
+    tops: Array | None = None,
+    note: str = "",
+) -> None:
     """Draw one plan.
 
     Args:
@@ -37,6 +46,8 @@ def plot_plan(problem: Problem, robot: Robot, motion: Motion, index: int, path: 
         motion: N motions.
         index: Which of them.
         path: Picture file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
+        tops: Heights of the obstacles' upper faces [m], shape (obstacles,); by default as the motion's ends have them.
+        note: What the title says besides.
 
     Raises:
         UsageError: There is no such plan, or it has no course that could be drawn.
@@ -51,13 +62,15 @@ def plot_plan(problem: Problem, robot: Robot, motion: Motion, index: int, path: 
     one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
     with np.errstate(all="ignore"):
         world, s, t = _along(problem, robot, one, index)
+    if tops is None:
+        tops = obstacle_tops(problem, world.tip_position[:, 0], world.tip_position[:, -1])
     figure = Figure(figsize=(15, 9), layout="constrained", dpi=110)
-    figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s")
+    figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
     joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]
     _draw_joints(joints, world, t)
     table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
     if table is None:
-        _draw_views(tip, problem, world)
+        _draw_views(tip, problem, world, tops)
     else:
         _draw_over_table(tip, table, world, s, t)
     try:
@@ -78,8 +91,6 @@ def _along(problem: Problem, robot: Robot, motion: Motion, index: int) -> tuple[
         raise UsageError(f"plan {index} cannot be drawn: its numbers are not finite")
     world = PathWorld(problem, robot)
     world.set_path(q, dq, ddq, np.zeros(len(problem.obstacle)))
-    ends = world.tip_position[:, 0], world.tip_position[:, -1]
-    world.set_path(q, dq, ddq, obstacle_tops(problem, *ends))
     return world, s, t
 
 
@@ -135,10 +146,8 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
     beside.grid(color="0.9", linewidth=0.6)
 
 
-def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld) -> None:
+def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, tops: Array) -> None:
     """Draw arm, object and obstacles from the side (y-z) and from above (x-y)."""
-    start, goal = world.tip_position[:, 0], world.tip_position[:, -1]
-    tops = obstacle_tops(problem, start, goal)
     boxes = [
         ((box.x.low, box.x.high), (box.y.low, box.y.high), (-0.2 if box.height is None else top - box.height, top))
         for box, top in zip(problem.obstacle, tops, strict=True)

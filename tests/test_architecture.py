@@ -23,7 +23,7 @@ LAYERS = (
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
     ("interop",),
-    ("make_shard", "make", "validation", "consistency", "shard_checks", "inspection", "describe", "plots", "doctor"),
+    ("make_shard", "make", "validation", "evaluation", "inspection", "describe", "plots", "doctor"),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.
@@ -147,7 +147,9 @@ def python(code: str) -> str:
     return done.stdout.splitlines()[-1]
 
 
-@pytest.mark.parametrize("command", ["", "make-dataset", "validate", "inspect", "list", "show", "doctor"])
+@pytest.mark.parametrize(
+    "command", ["", "make-dataset", "validate", "inspect", "list", "show", "evaluate", "export", "doctor"]
+)
 def test_help_is_given_without_loading_anything_heavy(command: str) -> None:
     code = f"""
 import sys

@@ -93,6 +93,13 @@ def test_a_transport_is_drawn_from_the_side_and_from_above(drawn):
         np.testing.assert_allclose(np.ravel(goal.get_data()), seen.tip[-1, [across, up]], atol=1e-9)
 
 
+def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_is_told(drawn):
+    plan = load("transport")
+    plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), tops=np.array([0.1, 0.2]), note="not valid")
+    assert [patch.get_bbox().y1 for patch in axes_of(drawn[0])["side view"].patches] == pytest.approx([0.1, 0.2])
+    assert drawn[0].get_suptitle() == f"heavy-object, plan 0: {plan.motion.duration()[0]:.3f} s\nnot valid"
+
+
 @pytest.mark.parametrize("label", ["hit", "transport"])
 @pytest.mark.parametrize("by", [1.0, 1e3, 1e150])
 def test_a_plan_beyond_its_limits_is_drawn_too(label, by, tmp_path):

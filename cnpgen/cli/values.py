@@ -8,6 +8,7 @@ _PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
 MOST_ROWS = 10**12  # make.MAX_ROWS, and
 _LONGEST = 30  # digits; no number here has more, and very long ones take long to read
+MOST_CHOSEN = 10**7  # of the numbers in a range
 
 
 def whole(text: str) -> int:
@@ -77,3 +78,37 @@ def plot_file(text: str) -> str:
     if not text.lower().endswith((".png", ".pdf", ".svg")):
         raise ArgumentTypeError(f"expected a file that ends in .png, .pdf or .svg, got {text!r}")
     return text
+
+
+def seconds(text: str) -> float:
+    """Read a time above 0: ``0.001`` or ``1ms``."""
+    return _quantity(text, "s", "a time above 0, such as 0.001 or 1ms")
+
+
+def hertz(text: str) -> float:
+    """Read a rate above 0: ``1000`` or ``1000Hz``."""
+    return _quantity(text, "1/s", "a rate above 0, such as 1000 or 1000Hz")
+
+
+def _quantity(text: str, unit: str, expected: str) -> float:
+    from cnpgen.units import parse_number
+
+    try:
+        number = parse_number(text, unit)
+    except ValueError as error:
+        raise ArgumentTypeError(f"expected {expected}; got {text!r}: {error}") from error
+    if number <= 0:
+        raise ArgumentTypeError(f"expected {expected}; got {text!r}")
+    return number
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Read whole numbers and ranges of them, ends included: ``0,3,10-12``."""
+    found: list[int] = []
+    for item in text.split(","):
+        ends = re.fullmatch(r"\s*(-?[0-9]+)\s*(?:-\s*([0-9]+))?\s*", item[:_LONGEST])
+        low, high = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
+        if not low <= high < low + MOST_CHOSEN:
+            raise ArgumentTypeError(f"expected whole numbers such as 0,3,10-12; got {text[:60]!r}")
+        found += range(low, high + 1)
+    return tuple(found)

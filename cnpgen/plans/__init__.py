@@ -2,7 +2,7 @@
 
 from cnpgen.plans.load import load_plans
 from cnpgen.plans.plans import Plans, concatenate, make_plans, screen
-from cnpgen.plans.problem import ProblemRecord, record_problem
+from cnpgen.plans.problem import ProblemRecord, open_problem, record_problem
 from cnpgen.plans.save import save_plans
 from cnpgen.plans.status import PlanStatus
 
@@ -13,6 +13,7 @@ __all__ = [
     "concatenate",
     "load_plans",
     "make_plans",
+    "open_problem",
     "record_problem",
     "save_plans",
     "screen",

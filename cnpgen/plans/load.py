@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.library import load_problem
+from cnpgen.plans.heaps import check_heaps
 from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
@@ -35,6 +36,8 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
     """
     path = Path(path)
     wanted = None if problem is None else record_problem(_loaded(problem))
+    if path.is_file():
+        check_heaps(path)
     with opened_hdf5(path) as file:
         attributes = {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
         _check_format(path, attributes)

@@ -56,8 +56,7 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
         UsageError: Shapes that do not fit together, or a step that is not positive.
     """
     _check_shapes(robot, motion, boundary, start_xyz, goal_xyz)
-    if not 0 < step < np.inf:
-        raise UsageError(f"the time step must be positive, got {step:g} s")
+    check_step(step)
     world, tops = PathWorld(problem, robot), obstacle_tops(problem, start_xyz, goal_xyz)
     with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
         return [
@@ -74,6 +73,16 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
             )
             for i in range(len(motion))
         ]
+
+
+def check_step(step: float) -> None:
+    """Refuse a time step [s] that makes no sense.
+
+    Raises:
+        UsageError: It does not.
+    """
+    if not 0 < step < np.inf:
+        raise UsageError(f"the time step must be positive, got {step:g} s")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.recipes import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.verdict.course import Course
+from cnpgen.verdict.parts import name_part
 from cnpgen.verdict.sampling import Samples
 from cnpgen.verdict.verdict import Margin, Reason
 from cnpgen.verify.path import PathWorld
@@ -71,14 +72,16 @@ def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> 
         samples: When and at which phase they are.
     """
     return [
-        _margin(constraint, condition, world, samples)
+        _margin(problem, constraint, condition, world, samples)
         for constraint in problem.constraint
         for condition in constraint.measured(cast("World", world))  # the same questions, answered for K states
         if condition.g
     ]
 
 
-def _margin(constraint: Constraint, condition: Condition, world: PathWorld, samples: Samples) -> Margin:
+def _margin(
+    problem: Problem, constraint: Constraint, condition: Condition, world: PathWorld, samples: Samples
+) -> Margin:
     g = np.empty((len(condition.g), len(samples.s)))
     for row, value in zip(g, condition.g, strict=True):
         row[:] = value
@@ -94,7 +97,7 @@ def _margin(constraint: Constraint, condition: Condition, world: PathWorld, samp
         condition.name,
         constraint.reason,
         condition.unit,
-        _part(condition, part, world.robot.joint_names),
+        name_part(problem, constraint, condition, part),
         value=float(g[part, k]),
         bound=float(condition.lower[part] - wider[k] if is_low else condition.upper[part] + wider[k]),
         excess=np.inf if np.isnan(worst) else worst,
@@ -102,12 +105,6 @@ def _margin(constraint: Constraint, condition: Condition, world: PathWorld, samp
         time=float(samples.t[k]),
         phase=float(samples.s[k]),
     )
-
-
-def _part(condition: Condition, part: int, joints: tuple[str, ...]) -> str:
-    if len(condition.g) == 1:
-        return ""
-    return joints[part] if len(condition.g) == len(joints) and condition.name.startswith("joint") else f"[{part}]"
 
 
 def by_name(margins: list[Margin]) -> dict[str, Margin]:

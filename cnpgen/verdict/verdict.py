@@ -17,7 +17,7 @@ class Reason(StrEnum):
     BOUNDARY = "boundary conditions"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Margin:
     """Where a plan comes closest to breaking a condition, or breaks it most.
 
@@ -25,7 +25,7 @@ class Margin:
         name: The condition.
         reason: Under which reason a plan that breaks it is counted.
         unit: SI unit of value, bound, excess and allowed.
-        part: Which of the condition's values: a joint's name, a number, or empty if it has only one.
+        part: Which of the condition's values: a joint, an axis, an obstacle, or empty if it has only one.
         value: The value there.
         bound: The bound that it is nearest to, or beyond.
         excess: How far beyond; negative: how far from it. inf if it could not be evaluated.
@@ -64,7 +64,7 @@ class Margin:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the margin for JSON, which knows no infinity: what is not finite is None."""
-        return {**_for_json(vars(self)), "ok": self.ok}
+        return {**_for_json({entry.name: getattr(self, entry.name) for entry in fields(self)}), "ok": self.ok}
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Verdict:
             "worst": worst and worst.to_dict(),
             "margins": {name: margin.to_dict() for name, margin in self.margins.items()},
             "metrics": self.metrics.to_dict(),
-            "paper": {entry.name: getattr(self.paper, entry.name) for entry in fields(self.paper)},
+            "paper": {"finished": self.paper.finished, "valid": self.paper.valid, "broken": list(self.paper.broken)},
             "samples": self.samples,
         }
 

@@ -1,0 +1,109 @@
+"""``cnpgen evaluate``: judge the plans of a file with Pinocchio and Coal."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.progress import Meter
+
+if TYPE_CHECKING:
+    from cnpgen.evaluation import Evaluation
+    from cnpgen.verdict import Verdict
+
+_TEXT = """\
+Every plan is looked at on a fine time grid and judged for itself; docs/verdict.md says by what. The exit code is 0 if
+every plan is valid, and 1 if any is not, if there are none, or if the file is damaged. --workers changes nothing but
+the time that it takes.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "evaluate", run, title="judge the plans of a file", text=_TEXT)
+    option = parser.add_argument
+    option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
+    option("--problem", metavar="NAME|FILE", help="the problem that they must be for; its tolerances count")
+    option("--step", metavar="S", type=values.seconds, default=1e-3, help="time between two looks (default: 1ms)")
+    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    option("--list", action="store_true", help="list the plans, too: a line each, those that are not valid first")
+    option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan: .png, .pdf or .svg")
+    option("--plan", metavar="I", type=values.natural, help="the plan to draw; default the first that is not valid")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.errors import UsageError
+
+    if arguments.plan is not None and not arguments.plot:
+        raise UsageError("--plan says which plan is drawn: it goes with --plot only")
+    found = _evaluate(arguments)
+    if arguments.json:
+        _write_json(arguments.file, found)
+    else:
+        from cnpgen.cli.verdict_text import listing_text, summary_text
+
+        print(summary_text(arguments.file, found))
+        if arguments.list:
+            print(f"\n{listing_text(found)}")
+    if arguments.plot:
+        _draw(found, arguments.plot, arguments.plan)
+    return 0 if len(found.verdicts) and found.valid.all() else 1
+
+
+def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
+    from cnpgen.errors import UsageError
+    from cnpgen.evaluation import evaluate_plans
+    from cnpgen.plans import load_plans
+
+    plans = load_plans(arguments.file, problem=arguments.problem)
+    if arguments.plan is not None and arguments.plan >= len(plans):
+        raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
+    meter = Meter(quiet=not sys.stderr.isatty())
+    meter.begin(f"judging {arguments.file}", len(plans))
+    try:
+        return evaluate_plans(plans, step=arguments.step, workers=arguments.workers, progress=meter)
+    finally:
+        meter.close()
+
+
+def _write_json(file: Path, found: "Evaluation") -> None:
+    """Write one document, plan by plan: all of them at once need much memory."""
+    from cnpgen.store.documents import render
+
+    head = render({"file": str(file), **found.summary()})
+    print(head.removesuffix("\n}") + ',\n  "verdicts": [', end="")
+    for index, row in enumerate(found.rows()):
+        print(f"{',' if index else ''}\n    {json.dumps(row, ensure_ascii=False, allow_nan=False)}", end="")
+    print("\n  ]\n}")
+
+
+def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
+    from cnpgen.plan_plots import plot_plan
+    from cnpgen.plans import open_problem
+    from cnpgen.robots.obstacles import obstacle_tops
+
+    plans, chosen = found.plans, _chosen(found) if index is None else index
+    problem, robot = open_problem(plans.problem)
+    tops = obstacle_tops(problem, plans.columns["start_xyz"][chosen], plans.columns["goal_xyz"][chosen])
+    note = f"sample {plans.sample_id[chosen]}: {_said(found.verdicts[chosen])}"
+    plot_plan(problem, robot, plans.motion, chosen, picture, tops=tops, note=note)
+    print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
+
+
+def _chosen(found: "Evaluation") -> int:
+    """Choose the plan that is drawn: the first that is not valid and can be drawn, else the first that can be."""
+    from cnpgen.errors import DatasetError
+
+    able = [index for index, verdict in enumerate(found.verdicts) if verdict.margins]
+    if not able:
+        raise DatasetError("none of the plans can be drawn: none can be evaluated")
+    return next((index for index in able if not found.verdicts[index].valid), able[0])
+
+
+def _said(verdict: "Verdict") -> str:
+    return "valid" if verdict.valid else f"{verdict.reason} ({verdict.worst})"

@@ -1,0 +1,85 @@
+"""``cnpgen export``: plans as sampled trajectories for robots and simulators."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command
+
+if TYPE_CHECKING:
+    from cnpgen.export import Exported
+    from cnpgen.plans import Plans
+
+FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.export, which takes a while to import
+
+_TEXT = """\
+npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
+docs/plan-format.md shows how to read them. What was written is printed on stdout. Plans that cannot be sampled are
+named on stderr and left out; the exit code is then 1.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
+    option = parser.add_argument
+    option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
+    option("--to", metavar="FORM", required=True, choices=FORMS, help="the form: npz, csv or joint-trajectory")
+    option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
+    option("-o", "--out", metavar="PATH", type=Path, help="file (npz) or folder to write; default: named after FILE")
+    option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
+    option("--sample", metavar="I", type=values.numbers, help="the plans of these samples only, by sample_id")
+    option("--force", action="store_true", help="replace files that are there")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.export import export_plans
+    from cnpgen.plans import load_plans
+
+    plans = load_plans(arguments.file)
+    out = _place(arguments)
+    exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=_chosen(plans, arguments))
+    for why in exported.refused.values():
+        print(f"cnpgen: left out: {why}", file=sys.stderr)
+    print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
+    print(exported.files[0] if arguments.to == "npz" else out)
+    return 1 if exported.refused else 0
+
+
+def _counted(exported: "Exported") -> str:
+    from cnpgen.wording import counted
+
+    all_plans = exported.count + len(exported.refused)
+    return counted(exported.count, "plan") + (f" of {all_plans:,}" if exported.refused else "")
+
+
+def _place(arguments: argparse.Namespace) -> Path:
+    """Return where to write to, which must be free without ``--force``."""
+    from cnpgen.errors import UsageError
+
+    file: Path = arguments.file
+    out: Path = arguments.out or Path(f"{file.stem}.npz" if arguments.to == "npz" else file.stem)
+    target = out / "plans.npz" if arguments.to == "npz" and out.is_dir() else out
+    if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
+        raise UsageError(f"{target} is there already; --force replaces what has the same name")
+    return out
+
+
+def _chosen(plans: "Plans", arguments: argparse.Namespace) -> list[int] | None:
+    """Return the indices of the plans that are wanted, or None for all of them."""
+    import numpy as np
+
+    from cnpgen.errors import UsageError
+
+    if arguments.plan is None and arguments.sample is None:
+        return None
+    chosen = set(arguments.plan or ())
+    if arguments.sample is not None:
+        missing = np.setdiff1d(arguments.sample, plans.sample_id)
+        if missing.size:
+            raise UsageError(f"{arguments.file} has no plan of sample {missing[0]}")
+        chosen |= set(np.flatnonzero(np.isin(plans.sample_id, arguments.sample)).tolist())
+    return sorted(chosen)

@@ -1,0 +1,116 @@
+"""What ``cnpgen evaluate`` prints: counts, reasons, figures, margins; and the plans one by one."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.describe import table
+from cnpgen.wording import counted
+
+if TYPE_CHECKING:
+    from cnpgen.evaluation import Evaluation
+    from cnpgen.verdict import Margin, Verdict
+
+METRICS = {  # metric -> what it is called, in a summary and in a list, and its format
+    "duration_s": ("motion time [s]", "T [s]", "{:.4f}"),
+    "z_error_mm_s": ("z error [mm s]", "z [mm s]", "{:.3f}"),
+    "vertical_error_rad_s": ("vertical error [rad s]", "tilt [rad s]", "{:.4f}"),
+    "hit_speed_m_s": ("speed at the goal [m/s]", "v [m/s]", "{:.2f}"),
+    "effort_s": ("effort [s]", "effort [s]", "{:.3f}"),
+    "jerk": ("largest jerk [5/s x limit]", "jerk", "{:.2f}"),
+}
+_TALLIES = {
+    "valid": "valid",
+    "paper_valid": "valid by the paper's rules",
+    "finished": "at the goal by the paper's rules",
+}
+
+
+def summary_text(file: Path, found: "Evaluation") -> str:
+    """Lay out what is said of all plans together."""
+    summary, count = found.summary(), len(found.verdicts)
+    step = f"{1e3 * found.step:g} ms"
+    head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, looked at every {step} or more often"
+    if not count:
+        return head
+    tallies = [
+        (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
+        for name, text in _TALLIES.items()
+    ]
+    sections = [[head, "", *table(tallies, indent="  ", right=(1, 2))]]
+    tables = (_reasons(found, summary), (1,)), (_figures(summary), range(1, 7)), (_margins(summary), (1, 2, 3, 5, 6))
+    sections += [table(rows, indent="  ", right=tuple(right)) for rows, right in tables if len(rows) > 1]
+    return "\n\n".join("\n".join(lines) for lines in sections)
+
+
+def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Say why plans are not valid, the most frequent reason first."""
+    rows: list[tuple[str, ...]] = [("not valid because", "plans", "the worst of them")]
+    for reason, number in summary["reasons"].items():
+        plans = [(index, verdict) for index, verdict in enumerate(found.verdicts) if str(verdict.reason) == reason]
+        index, worst = max(plans, key=lambda plan: _severity(plan[1]))
+        if not worst.valid:
+            rows.append((reason, f"{number:,}", f"plan {index}{f': {worst.worst}' if worst.worst else ''}"))
+    return rows
+
+
+def _severity(verdict: "Verdict") -> float:
+    return verdict.worst.severity if verdict.worst else -math.inf
+
+
+def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Lay out the metrics: of valid plans, of those valid by the paper's rules, and of all."""
+    columns = [("metrics_of_valid", name) for name in ("mean", "median", "p95", "max")]
+    columns += [("metrics_of_paper_valid", "mean"), ("metrics_of_all", "mean")]
+    rows: list[tuple[str, ...]] = [("", "valid: mean", "median", "95 %", "largest", "paper's: mean", "all: mean", "")]
+    for name, (text, _, form) in METRICS.items():
+        values = [summary[group].get(name, {}).get(what) for group, what in columns]
+        if any(value is not None for value in values):
+            rows.append((text, *("-" if value is None else form.format(value) for value in values), ""))
+    return rows
+
+
+def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Lay out how many plans break each condition, and which comes closest to its bound or is furthest beyond."""
+    rows: list[tuple[str, ...]] = [
+        ("condition", "broken by", "worst excess", "allowed", "unit", "plan", "t [s]", "where")
+    ]
+    for name, worst in summary["conditions"].items():
+        excess = "-" if worst["excess"] is None else f"{worst['excess']:.2e}"
+        at = "-" if worst["time"] is None else f"{worst['time']:.4f}"
+        allowed = f"{worst['allowed']:.1e}"
+        cells = (f"{worst['plans_out']:,}", excess, allowed, worst["unit"], str(worst["worst_plan"]), at, worst["part"])
+        rows.append((name, *cells))
+    return rows
+
+
+def listing_text(found: "Evaluation") -> str:
+    """List the plans, those that are not valid first."""
+    order = sorted(range(len(found.verdicts)), key=lambda index: found.verdicts[index].valid)
+    metrics = {index: found.verdicts[index].metrics.to_dict() for index in order}
+    shown = [name for name in METRICS if any(name in values for values in metrics.values())]
+    rows = [
+        ("plan", "sample", "verdict", *(METRICS[name][1] for name in shown), "nearest to a bound, or furthest beyond")
+    ]
+    for index in order:
+        figures = [METRICS[name][2].format(metrics[index][name]) if name in metrics[index] else "-" for name in shown]
+        verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
+        rows.append((str(index), str(sample), str(verdict.reason), *figures, _worst(verdict.worst)))
+    return "\n".join(_columns(rows, left={2, len(rows[0]) - 1}))
+
+
+def _worst(margin: "Margin | None") -> str:
+    return str(margin) if margin else "-"
+
+
+def _columns(rows: list[tuple[str, ...]], left: set[int]) -> list[str]:
+    """Align cells in lines of any length: one plan is one line, for ``grep`` and ``sort``."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    padded = [
+        [
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        for row in rows
+    ]
+    return ["  ".join(cells).rstrip() for cells in padded]

@@ -1,0 +1,53 @@
+"""Damage on which HDF5 itself would hang: global heaps, where texts of variable length are, that do not add up."""
+
+import mmap
+import struct
+from pathlib import Path
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.files import machine_error
+
+_BEGIN = b"GCOL\x01\0\0\0"  # of a collection: signature and version; as a number it would be 7e-315
+_HEADER = 16  # bytes, of a collection and of each object in it
+
+
+def check_heaps(path: Path) -> None:
+    """Refuse a file with a global heap collection whose objects do not fill it.
+
+    The library walks from object to object by their sizes; where one is damaged it comes upon zeros, an object of no
+    size at all, and does not move on (HDF5 2.0, function H5HG__cache_heap_deserialize).
+
+    Args:
+        path: An HDF5 file.
+
+    Raises:
+        DatasetError: There is such a collection.
+        MachineError: The system would not let us read it.
+    """
+    try:
+        with path.open("rb") as file:
+            if file.seek(0, 2) == 0:
+                return
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                place = content.find(_BEGIN)
+                while place >= 0:
+                    if place % 8 == 0 and not _adds_up(content, place):
+                        raise DatasetError(f"{path} is damaged: its texts at byte {place} cannot be read")
+                    place = content.find(_BEGIN, place + 1)
+    except OSError as error:
+        raise machine_error("read", path, error) from error
+
+
+def _adds_up(content: mmap.mmap, begin: int) -> bool:
+    """Walk through a collection as HDF5 does; free space, object 0, is the last and ends where the collection ends."""
+    size: int = struct.unpack_from("<Q", content, begin + 8)[0]
+    end = begin + size
+    if end > len(content):
+        return False
+    place = begin + _HEADER
+    while place + _HEADER <= end:
+        number, _, _, length = struct.unpack_from("<HHIQ", content, place)
+        if number == 0:
+            return bool(place + length == end)
+        place += _HEADER + (length + 7) // 8 * 8
+    return bool(place <= end)
