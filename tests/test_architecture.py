@@ -23,7 +23,8 @@ LAYERS = (
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
     ("interop",),
-    ("make_shard", "make", "validation", "evaluation", "inspection", "describe", "plots", "doctor"),
+    ("make_shard", "make", "validation", "consistency", "shard_checks", "inspection", "describe", "plots", "doctor"),
+    ("evaluation",),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.
