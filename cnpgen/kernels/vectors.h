@@ -2,10 +2,10 @@
 functions of them.
 
 Comparisons are 1 or 0, as in CasADi; minima and maxima ignore a nan, as C's fmin and CasADi's do (the instructions, here
-lesser and larger, return their second operand if either is nan). Sine and cosine reduce their argument by pi/2 in three
-parts (Cody and Waite; of 33, 33 and 53 bits as in fdlibm, or of 8, 11 and 24 bits), the exponential by ln 2 in two; the
+lesser and larger, return their second operand if either is nan). Sine and cosine reduce their argument by pi/2 in parts
+(Cody and Waite; of 33, 33 and 53 bits as in fdlibm, or of 8, 11, 11 and 24 bits), the exponential by ln 2 in two; the
 polynomials are those of the Cephes mathematical library. Errors are at most 2 ulp: of the exponential everywhere, of sine
-and cosine for |x| up to 2^20 (float: up to 2^8; to 2^13 they are right to 2e-7, but not to 2 ulp beside their zeros). */
+and cosine, also beside their zeros, for |x| up to 2^20 (float: up to 2^8, and 3 ulp up to 2^13). */
 
 #include <math.h>
 #include <string.h>
@@ -18,7 +18,8 @@ typedef int integer;
 #define TWO_OVER_PI 0.636619772f
 #define PI_2_HIGH 1.5703125f
 #define PI_2_MIDDLE 4.837512969970703125e-4f
-#define PI_2_LOW 7.54978995489188216e-8f
+#define PI_2_LOW 7.549533620476723e-8f
+#define PI_2_LOWEST 2.5633440682570896e-12f
 #define LOG2E 1.44269504f
 #define LN2_HIGH 0.693359375f
 #define LN2_LOW (-2.12194440e-4f)
@@ -147,8 +148,11 @@ I void vsincos(v x, v *s, v *c) {
   v n = x * K(TWO_OVER_PI) + K(MAGIC);
   vi quadrant = (vi)n;
   n -= K(MAGIC);
-  v r = ((x - n * K(PI_2_HIGH)) - n * K(PI_2_MIDDLE)) - n * K(PI_2_LOW), z = r * r;
-  v sine = reduced_sin(r, z), cosine = reduced_cos(z);
+  v r = ((x - n * K(PI_2_HIGH)) - n * K(PI_2_MIDDLE)) - n * K(PI_2_LOW);
+#ifdef SINGLE
+  r -= n * K(PI_2_LOWEST);
+#endif
+  v z = r * r, sine = reduced_sin(r, z), cosine = reduced_cos(z);
   vi odd = -(quadrant & 1);
   v a = pick(odd, cosine, sine), b = pick(odd, sine, cosine);
   int sign = 8 * (int)sizeof(real) - 2;
