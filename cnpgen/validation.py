@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.consistency import check_recipe, check_statistics
-from cnpgen.errors import CnpgenError, DatasetError, UsageError
-from cnpgen.kernels.library import choose_backend
+from cnpgen.errors import CnpgenError, DatasetError, MachineError, UsageError
+from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.library import restore_dataset_recipe
 from cnpgen.make import worker_count
 from cnpgen.make_shard import shard_columns, versions
 from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
-from cnpgen.recipes import DatasetRecipe
+from cnpgen.recipes import DatasetRecipe, recipe_digest
 from cnpgen.robots.robot import load_robot
 from cnpgen.shard_checks import check_numbers
 from cnpgen.store.check import Finding, check_dataset
@@ -111,7 +111,9 @@ def validate_dataset(
     Raises:
         UsageError: There is no dataset, or an argument makes no sense.
         RecipeError: The recipe in the plan does not fit this version of cnpgen.
-        MachineError: The disk or the backend fails.
+        PluginError: It needs packages that are not installed, for what was asked for.
+        MachineError: The disk fails, or the backend that made the dataset does not work here and blocks are to be
+            made again.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -123,6 +125,11 @@ def validate_dataset(
         plan = load_plan(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
+    if regenerate:
+        _backend(folder, plan)
+    if deep or regenerate:
+        with restored(plan):  # what is missing on this machine is said before anything takes long
+            pass
     wrong = {finding.file for finding in findings if not finding.note}
     present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
     whole = [task for task in present if task.file not in wrong]
@@ -202,7 +209,7 @@ def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: 
     if plan.block_rows != BLOCK_ROWS:
         raise UsageError(f"the blocks of {folder} have {plan.block_rows} rows, those of this version {BLOCK_ROWS}")
     pieces = [(task, block) for task in tasks for block in _blocks(task)]
-    backend, cache_folder = choose_backend(plan.backend)
+    backend, cache_folder = _backend(folder, plan)
     dataset = StoredDataset(folder, plan, None)  # whatever became of the manifest
     chosen = np.random.default_rng().permutation(len(pieces))[:count]
     identical, findings = 0, []
@@ -215,7 +222,7 @@ def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: 
             same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
             identical += same
             if problem:
-                text = f"block {block} made again from the seed: {problem}{_explanation(plan)}"
+                text = f"block {block} made again from the seed: {problem}{_explanation(plan, recipe)}"
                 findings.append(Finding(task.file, text))
     return len(chosen), identical, findings
 
@@ -223,6 +230,17 @@ def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: 
 def _blocks(task: ShardTask) -> range:
     """List the blocks that a shard has rows of."""
     return range(task.first_row // BLOCK_ROWS, (task.first_row + task.rows - 1) // BLOCK_ROWS + 1)
+
+
+def _backend(folder: Path, plan: DatasetPlan) -> tuple[Backend, Path]:
+    """Return the backend that made a dataset, and its cache."""
+    try:
+        return choose_backend(plan.backend)
+    except MachineError as error:
+        raise MachineError(
+            f"{folder} was made by the {plan.backend} backend, which does not work here ({error}): its blocks cannot"
+            " be made again; 'cnpgen validate' and 'cnpgen validate --deep' work without it"
+        ) from error
 
 
 def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
@@ -236,10 +254,12 @@ def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
     return same, ""
 
 
-def _explanation(plan: DatasetPlan) -> str:
-    """Name the libraries that are not those that made the dataset."""
+def _explanation(plan: DatasetPlan, recipe: DatasetRecipe) -> str:
+    """Name the libraries and plug-ins that are not those that made the dataset."""
     now = versions()
     other = [f"{name} {was} -> {now.get(name)}" for name, was in plan.versions.items() if now.get(name) != was]
+    if recipe_digest(recipe) != plan.recipe_sha256:  # the plan's own recipe, so that only code can be different
+        other.append("the code of its plug-ins has changed")
     return f" (made with other versions: {', '.join(other)})" if other else ""
 
 

@@ -49,7 +49,7 @@ def run(command: list[str], folder: Path, code: int = 0) -> str:
         command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=600, check=False
     )
     assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done.stdout if code == 0 else done.stderr
+    return done.stdout if code == 0 else done.stdout + done.stderr
 
 
 def test_every_block_says_what_it_is() -> None:
@@ -101,6 +101,13 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     rejected = run(["cnpgen", "inspect", "slow"], tmp_path)
     assert "hit too fast" in rejected
     assert "in the circle" in rejected
+
+    code = (source / "my_hockey.py").read_text(encoding="utf-8")
+    (source / "my_hockey.py").write_text(
+        code.replace("<= self.max_speed,", "<= 0.5 * self.max_speed,"), encoding="utf-8"
+    )
+    changed = run(["cnpgen", "validate", "slow", "--regenerate", "1"], tmp_path, code=1)
+    assert "made with other versions: the code of its plug-ins has changed" in changed
 
     (source / "my_hockey-1.0.dist-info" / "entry_points.txt").unlink()  # as if it were not installed
     run(["cnpgen", "validate", "slow"], tmp_path)

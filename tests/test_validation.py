@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import SHIPPED, TINY_SHARD, Arm, tiny_recipe
+from conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, tiny_recipe
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.library import load_problem
@@ -332,6 +332,17 @@ def test_the_backend_of_the_plan_makes_the_blocks_again(tmp_path):
     make_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out", workers=1, backend="numpy")
     report = validate_dataset(tmp_path / "out", regenerate=2)
     assert (report.ok, report.identical) == (True, 2)
+
+
+@needs_compiler
+def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(tiny: Tiny, monkeypatch, fresh_compiler):
+    folder = tiny("airhockey-hit")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(MachineError, match="was made by the compiled backend, which does not work here") as caught:
+        validate_dataset(folder, deep=True, regenerate=1, workers=1)
+    assert "CC is 'no-such-compiler'" in str(caught.value)
+    assert "'cnpgen validate --deep' work without it" in str(caught.value)
+    assert validate_dataset(folder, deep=True, workers=1).ok
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------
