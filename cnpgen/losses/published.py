@@ -43,14 +43,16 @@ def _zero(name: str, unit: str, value: Any) -> tuple[Condition, ...]:
 
 
 def _points(state: SymbolicState) -> list[Vec]:
-    """Joint origins and points between them."""
+    """Ends of the robot's segments, each once, and points between them."""
     base = forward_kinematics(state.robot.chain, [float(q) for q in state.robot.base])
     origins = [np.array(x, float) for x in (*base.origins, base.tip)]
-    points: list[Vec] = []
+    ends: dict[int, Vec] = {}
+    between: list[Vec] = []
     for (a, b), (i, j) in zip(state.segments, state.robot.skeleton, strict=True):
-        pieces = max(ceil(float(np.linalg.norm(origins[j] - origins[i])) / APART), 1)
-        points += [add(a, scale(subtract(b, a), k / pieces)) for k in range(pieces + 1)]
-    return points
+        pieces = ceil(float(np.linalg.norm(origins[j] - origins[i])) / APART - 1e-9)
+        between += [add(a, scale(subtract(b, a), k / pieces)) for k in range(1, pieces)]
+        ends |= {i: a, j: b}
+    return [*ends.values(), *between]
 
 
 def _distance(point: Vec, boxes: list[Any]) -> Any:
