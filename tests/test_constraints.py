@@ -1,6 +1,7 @@
 """Every kind of constraint: its symbolic form against its measurement, and a met and a violated case of each."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -49,7 +50,10 @@ def gantry_urdf() -> str:
 
 @pytest.fixture(scope="module")
 def gantry(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    folder = tmp_path_factory.mktemp("gantry")
+    return gantry_problem(tmp_path_factory.mktemp("gantry"))
+
+
+def gantry_problem(folder: Path) -> Problem:
     (folder / "gantry.urdf").write_text(gantry_urdf())
     joints = tuple(name for name, kind, *_ in GANTRY_JOINTS if kind != "fixed")
     spec = RobotSpec(urdf="gantry.urdf", joints=joints, tip="grip_link", base=(0.0,) * 5)

@@ -1,5 +1,6 @@
 """Exact distances between the robot's capsules, an upright cuboid and axis-aligned boxes, as SX."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -8,11 +9,12 @@ from cnpgen.robots.symbolic import Vec
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
 ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one is needed
+TOUCHING = 1e-30  # m^2: the square root of less has no gradient
 POINT = 1e-12  # m^2: keeps a distance of nothing, and a segment of no extent along an axis, differentiable
 
 
 def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
-    """Distance from a segment to an axis-aligned box [m], 0 where they touch.
+    """Distance from a segment to an axis-aligned box [m]; 0, and without a gradient, where they touch.
 
     ``d^2`` of the point ``first + t (second - first)`` is convex in t and its derivative is piecewise linear with a
     knot where a coordinate meets a face. The knots bracket the minimum; between the two nearest the derivative is
@@ -28,7 +30,7 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
     along = [b - a for a, b in zip(first, second, strict=True)]
     t = _nearest(first, along, box)
     outside = [_outside(first[axis] + t * along[axis], box[axis]) for axis in range(3)]
-    return ca.sqrt(sum(x * x for x in outside))
+    return ca.sqrt(ca.fmax(sum(x * x for x in outside), TOUCHING)) - math.sqrt(TOUCHING)
 
 
 def signed_segment_box_distance(first: Vec, second: Vec, box: Bounds, *, hold: Callable[[Scalar], Scalar]) -> Scalar:
