@@ -17,6 +17,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.store.files import read_file, write_file
 
 _BLANK = "0" * 64
+_SCALARS = frozenset({int, bool, str, type(None)})  # types that are JSON's own, whatever the value
 _SEAL = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
 
 
@@ -31,7 +32,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        kinds = set(map(type, value))
+        return list(value) if kinds <= _SCALARS else [plain(item) for item in value]  # long lists of counts are common
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if value is None or isinstance(value, bool | int | float | str):

@@ -107,8 +107,9 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field],
         if values.shape != shape or values.dtype != stored:
             found = f"{values.dtype} of shape {values.shape}"
             raise DatasetError(f"field {field.name!r} must be {stored} of shape {shape}, got {found}")
-        bad = ~np.isfinite(values).reshape(rows, -1).all(axis=1)
-        if bad.any():
+        finite = np.isfinite(values)
+        if not finite.all():
+            bad = ~finite.reshape(rows, -1).all(axis=1)
             raise DatasetError(f"field {field.name!r} is not finite in {bad.sum()} rows, first in row {bad.argmax()}")
 
 

@@ -116,18 +116,18 @@ def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
     Returns:
         The statistics of its columns.
     """
-    table = np.asarray(values, np.float64).reshape(len(values), -1)
-    mean = table.mean(axis=0)
-    low, high = _limits(field, table.shape[1])
+    columns = np.ascontiguousarray(np.asarray(values, np.float64).reshape(len(values), -1).T)  # NumPy likes long rows
+    mean = columns.mean(axis=1)
+    low, high = _limits(field, len(columns))
     return FieldStatistics(
-        count=len(table),
+        count=columns.shape[1],
         mean=mean,
-        m2=np.square(table - mean).sum(axis=0),
-        minimum=table.min(axis=0),
-        maximum=table.max(axis=0),
+        m2=np.square(columns - mean[:, None]).sum(axis=1),
+        minimum=columns.min(axis=1),
+        maximum=columns.max(axis=1),
         low=low,
         high=high,
-        histogram=None if low is None or high is None else _histogram(table, low, high),
+        histogram=None if low is None or high is None else _histogram(columns, low, high),
     )
 
 
@@ -141,13 +141,12 @@ def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, N
     return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else (None, None)
 
 
-def _histogram(table: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
-    """Count the rows of every column in its bins, shape (c, 64)."""
+def _histogram(columns: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
+    """Count the rows of every column, shape (c, rows), in its bins, shape (c, 64)."""
     width = np.where(high > low, high - low, 1.0)
-    bins = np.clip(np.floor((table - low) / width * N_BINS), 0, N_BINS - 1).astype(np.int64)
-    columns = table.shape[1]
-    flat = bins + N_BINS * np.arange(columns)
-    return np.bincount(flat.ravel(), minlength=N_BINS * columns).reshape(columns, N_BINS)
+    places = (columns - low[:, None]) / width[:, None] * N_BINS
+    bins = np.clip(places, 0, N_BINS - 1).astype(np.int64)  # cut off, which is rounding down: none is negative
+    return np.array([np.bincount(row, minlength=N_BINS) for row in bins])
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field]) -> dict[str, FieldStatistics]:
