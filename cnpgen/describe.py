@@ -67,6 +67,8 @@ def describe_problem(problem: Problem, robot: Robot) -> str:
     facts += [("object", numbers(problem.object))] if problem.object else []
     facts += [("obstacle", f"{box.name}: {numbers(box, leave_out=('name',))}") for box in problem.obstacle]
     facts += [("motion", numbers(problem.trajectory))]
+    objective = numbers(problem.objective)
+    facts += [("objective", f"shortest time, and {objective}" if objective else "shortest time")]
     constraints = [(kind_name(item), numbers(item)) for item in problem.constraint]
     return "\n".join(
         [

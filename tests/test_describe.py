@@ -1,6 +1,7 @@
 """Recipes in words: complete, with numbers and units, and readable at 100 columns."""
 
 import json
+import re
 
 import pytest
 
@@ -87,6 +88,11 @@ def test_an_object_and_obstacles_are_described():
     text = describe(load_problem("heavy-object"))
     assert "(0.2, 0.2, 0.3) m" in text
     assert "pedestal-2: x [0.2, 0.6] m" in text
+
+
+def test_the_objective_is_described():
+    assert "objective  shortest time, and centrifugal 0.01 s^2/m" in describe(load_problem("airhockey"))
+    assert re.search(r"objective +shortest time\n", describe(load_problem("heavy-object")))
 
 
 @pytest.mark.parametrize("kind", ["problem", "pipeline", "dataset"])
