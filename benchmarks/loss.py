@@ -1,0 +1,208 @@
+"""The loss of plans and its gradient: microseconds per quadrature point, milliseconds per batch, errors of the rules.
+
+The clock is the process's CPU time. Every repetition measures all cases in turn; times are medians over the repetitions,
+ratios medians of the ratios within one repetition.
+
+    python benchmarks/loss.py
+    python benchmarks/loss.py --batch 64 --nodes 32 --repeat 50
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from common import arguments, median, progress, report, table, verdict
+
+from cnpgen.library import load_problem
+from cnpgen.losses import quadrature as rules
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.robots.robot import load_robot
+
+Array = np.ndarray[Any, np.dtype[Any]]
+PROBLEMS = ("airhockey", "heavy-object")
+WAYS = (("compiled", "float32"), ("compiled", "float64"), ("numpy", "float32"), ("casadi", "float64"))
+TARGET = 0.3  # us per point of the gradient kernel in float32
+FINE = 4096
+ROUGH = 0.05  # rad
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Arguments of a loss: lines between random configurations, with noise on every control point."""
+
+    path: Array
+    rate: Array
+    tops: Array
+
+
+def draw_plans(name: str, count: int) -> Plans:
+    problem, random = load_problem(name), np.random.default_rng(0)
+    robot, spec = load_robot(problem), load_problem(name).trajectory
+    ends = robot.base + random.uniform(-0.5, 0.5, (2, count, 1, robot.n))
+    along = np.linspace(0, 1, spec.path_control_points)[:, None]
+    path = ends[0] * (1 - along) + ends[1] * along
+    path += ROUGH * random.uniform(-1, 1, path.shape)
+    rate = random.uniform(0.8, 1.4, (count, spec.rate_control_points))
+    return Plans(path, rate, random.uniform(0.1, 0.4, (count, len(problem.obstacle))))
+
+
+@dataclass
+class Case:
+    """One problem in one way.
+
+    Attributes:
+        calls: CPU time of a call with gradient [s], one per repetition.
+        kernels: Of the gradient kernel alone.
+        values: Of a call without gradient.
+    """
+
+    problem: str
+    backend: str
+    dtype: str
+    loss: PlanLoss
+    plans: Plans
+    calls: list[float] = field(default_factory=list)
+    kernels: list[float] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+    def call(self, *, gradient: bool = True) -> None:
+        plans, weights = self.plans, np.ones(len(self.loss.terms) - 1)
+        self.loss(plans.path, plans.rate, weights=weights, tops=plans.tops, gradient=gradient)
+
+    def measure(self) -> None:
+        inside = timed(self.loss._gradient)
+        with mock.patch.dict(vars(self.loss), {"_gradient": inside}):
+            self.calls.append(seconds(self.call))
+        self.kernels.append(inside.seconds)
+        self.values.append(seconds(lambda: self.call(gradient=False)))
+
+
+class timed:  # noqa: N801 - a function with a memory
+    """A kernel that adds up its CPU time."""
+
+    def __init__(self, kernel: Any) -> None:
+        self.kernel, self.tape, self.seconds = kernel, kernel.tape, 0.0
+
+    def __call__(self, *given: Array, out: Any) -> None:
+        start = time.process_time()
+        self.kernel(*given, out=out)
+        self.seconds += time.process_time() - start
+
+
+def seconds(what: Callable[[], None]) -> float:
+    start = time.process_time()
+    what()
+    return time.process_time() - start
+
+
+def prepare(problem: str, backend: str, dtype: str, options: argparse.Namespace) -> Case:
+    loss = PlanLoss(load_problem(problem), dtype=dtype, nodes=options.nodes, backend=backend)  # type: ignore[arg-type]
+    plans = draw_plans(problem, options.batch)
+    if dtype == "float32":
+        plans = Plans(*(value.astype(np.float32) for value in vars(plans).values()))
+    case = Case(problem, backend, dtype, loss, plans)
+    case.call()
+    case.call(gradient=False)
+    return case
+
+
+def speed_table(cases: list[Case], points: int) -> str:
+    rows = []
+    for case in cases:
+        first = next(other for other in cases if other.problem == case.problem)
+        slower = median(other / own for own, other in zip(first.calls, case.calls, strict=True))
+        per_point = 1e6 * median(case.kernels) / points
+        target = TARGET if (case.backend, case.dtype) == ("compiled", "float32") else None
+        rows.append(
+            (case.problem, case.backend, case.dtype, f"{len(case.loss._gradient.tape):,}", f"{per_point:.3f}",
+             f"{1e3 * median(case.calls):.2f}", f"{1e3 * median(case.values):.2f}", f"{slower:.1f}",
+             *verdict(per_point, target, at_most=True))
+        )  # fmt: skip
+    head = (
+        "problem",
+        "backend",
+        "type",
+        "operations",
+        "us/point",
+        "ms/batch",
+        "no gradient",
+        "times slower",
+        "target",
+        "",
+    )
+    return table(f"Loss and gradient: kernel per point, whole call per batch ({points:,} points)", head, rows, left=3)
+
+
+def rule_table(problem: str, plans: Plans) -> str:
+    """Errors of the integrals and of the gradient, as the mean over plans of errors relative to a very fine rule."""
+
+    def evaluate(rule: str, nodes: int) -> tuple[Array, Array]:
+        loss = PlanLoss(load_problem(problem), dtype="float64", nodes=nodes, rule=rule)
+        weights = np.ones(len(loss.terms) - 1)
+        value = loss(plans.path, plans.rate, weights=weights, tops=plans.tops)
+        return value.total, value.path_gradient.reshape(len(plans.path), -1)
+
+    total, gradient = evaluate("cosine", FINE)
+    rows = []
+    for label, rule, nodes in [(r, r, n) for n in (32, 64, 128) for r in rules.RULES] + [
+        ("uniform", "cosine", n) for n in (64, 256, 1024)
+    ]:
+        rules.basis_table.cache_clear()
+        with mock.patch.object(rules, "quadrature", uniform if label == "uniform" else rules.quadrature):
+            found, slope = evaluate(rule, nodes)
+        rules.basis_table.cache_clear()
+        error = np.mean(np.abs(found - total) / total)
+        slope_error = np.mean(np.linalg.norm(slope - gradient, axis=1) / np.linalg.norm(gradient, axis=1))
+        rows.append((label, str(nodes), f"{100 * error:.2f} %", f"{100 * slope_error:.2f} %"))
+    return table(
+        f"{problem}: errors of quadrature rules against {FINE} nodes", ("rule", "nodes", "total", "gradient"), rows
+    )
+
+
+def uniform(_rule: str, nodes: int, _shift: float = 0.0) -> tuple[Array, Array]:
+    """What the losses do not offer: equal distances, ends included, equal weights."""
+    return np.linspace(0, 1, nodes), np.full(nodes, 1 / nodes)
+
+
+def results(cases: list[Case], points: int) -> dict[str, Any]:
+    return {
+        "points": points,
+        "cases": [
+            {
+                "problem": case.problem,
+                "backend": case.backend,
+                "dtype": case.dtype,
+                "operations": len(case.loss._gradient.tape),
+                "us_per_point": 1e6 * median(case.kernels) / points,
+                "ms_per_batch": 1e3 * median(case.calls),
+                "ms_per_batch_without_gradient": 1e3 * median(case.values),
+            }
+            for case in cases
+        ],
+    }
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--batch", type=int, default=128, help="plans per batch")
+    parser.add_argument("--nodes", type=int, default=64, help="quadrature nodes")
+    parser.add_argument("--repeat", type=int, default=15, help="repetitions")
+
+
+def main() -> None:
+    options = arguments(__doc__, add_options)
+    points = options.batch * options.nodes
+    cases = [prepare(problem, *way, options) for problem in PROBLEMS for way in WAYS]
+    for number in range(options.repeat):
+        progress(f"repetition {number + 1} of {options.repeat}")
+        for case in cases:
+            case.measure()
+    tables = [speed_table(cases, points), *(rule_table(problem, draw_plans(problem, 64)) for problem in PROBLEMS)]
+    report(results(cases, points), tables, as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()
