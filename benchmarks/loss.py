@@ -1,7 +1,7 @@
 """The loss of plans and its gradient: microseconds per quadrature point, milliseconds per batch, errors of the rules.
 
-The clock is the process's CPU time. Every repetition measures all cases in turn; times are medians over the repetitions,
-ratios medians of the ratios within one repetition.
+The clock is the process's CPU time. Every repetition measures all cases in turn; times are medians over the
+repetitions, ratios medians of the ratios within one repetition.
 
     python benchmarks/loss.py
     python benchmarks/loss.py --batch 64 --nodes 32 --repeat 50
@@ -70,24 +70,27 @@ class Case:
     values: list[float] = field(default_factory=list)
 
     def call(self, *, gradient: bool = True) -> None:
+        """Evaluate the batch."""
         plans, weights = self.plans, np.ones(len(self.loss.terms) - 1)
         self.loss(plans.path, plans.rate, weights=weights, tops=plans.tops, gradient=gradient)
 
     def measure(self) -> None:
-        inside = timed(self.loss._gradient)
+        """Time a call with gradient, the kernel in it, and a call without gradient."""
+        inside = Timed(self.loss._gradient)
         with mock.patch.dict(vars(self.loss), {"_gradient": inside}):
             self.calls.append(seconds(self.call))
         self.kernels.append(inside.seconds)
         self.values.append(seconds(lambda: self.call(gradient=False)))
 
 
-class timed:  # noqa: N801 - a function with a memory
+class Timed:
     """A kernel that adds up its CPU time."""
 
     def __init__(self, kernel: Any) -> None:
         self.kernel, self.tape, self.seconds = kernel, kernel.tape, 0.0
 
     def __call__(self, *given: Array, out: Any) -> None:
+        """Run the kernel."""
         start = time.process_time()
         self.kernel(*given, out=out)
         self.seconds += time.process_time() - start
@@ -122,55 +125,59 @@ def speed_table(cases: list[Case], points: int) -> str:
              f"{1e3 * median(case.calls):.2f}", f"{1e3 * median(case.values):.2f}", f"{slower:.1f}",
              *verdict(per_point, target, at_most=True))
         )  # fmt: skip
-    head = (
-        "problem",
-        "backend",
-        "type",
-        "operations",
-        "us/point",
-        "ms/batch",
-        "no gradient",
-        "times slower",
-        "target",
-        "",
-    )
-    return table(f"Loss and gradient: kernel per point, whole call per batch ({points:,} points)", head, rows, left=3)
+    head = ("problem", "backend", "type", "operations", "us/point", "ms/batch", "no gradient", "times slower", "target")
+    title = f"Loss and gradient: kernel per point, whole call per batch ({points:,} points)"
+    return table(title, (*head, ""), rows, left=3)
 
 
-def rule_table(problem: str, plans: Plans) -> str:
-    """Errors of the integrals and of the gradient, as the mean over plans of errors relative to a very fine rule."""
+@dataclass(frozen=True)
+class RuleError:
+    """Error of a rule: means over plans, relative to a very fine rule."""
+
+    problem: str
+    rule: str
+    nodes: int
+    total: float
+    gradient: float
+
+
+def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
+    """Errors of the offered rules, and of equal distances, which are not offered."""
 
     def evaluate(rule: str, nodes: int) -> tuple[Array, Array]:
+        rules.basis_table.cache_clear()
         loss = PlanLoss(load_problem(problem), dtype="float64", nodes=nodes, rule=rule)
-        weights = np.ones(len(loss.terms) - 1)
-        value = loss(plans.path, plans.rate, weights=weights, tops=plans.tops)
+        value = loss(plans.path, plans.rate, weights=np.ones(len(loss.terms) - 1), tops=plans.tops)
+        rules.basis_table.cache_clear()
         return value.total, value.path_gradient.reshape(len(plans.path), -1)
 
-    total, gradient = evaluate("cosine", FINE)
-    rows = []
-    for label, rule, nodes in [(r, r, n) for n in (32, 64, 128) for r in rules.RULES] + [
-        ("uniform", "cosine", n) for n in (64, 256, 1024)
-    ]:
-        rules.basis_table.cache_clear()
-        with mock.patch.object(rules, "quadrature", uniform if label == "uniform" else rules.quadrature):
-            found, slope = evaluate(rule, nodes)
-        rules.basis_table.cache_clear()
-        error = np.mean(np.abs(found - total) / total)
-        slope_error = np.mean(np.linalg.norm(slope - gradient, axis=1) / np.linalg.norm(gradient, axis=1))
-        rows.append((label, str(nodes), f"{100 * error:.2f} %", f"{100 * slope_error:.2f} %"))
-    return table(
-        f"{problem}: errors of quadrature rules against {FINE} nodes", ("rule", "nodes", "total", "gradient"), rows
-    )
+    total, slope = evaluate("cosine", FINE)
+
+    def error(label: str, nodes: int, rule: str) -> RuleError:
+        found, found_slope = evaluate(rule, nodes)
+        of_slope = np.linalg.norm(found_slope - slope, axis=1) / np.linalg.norm(slope, axis=1)
+        return RuleError(problem, label, nodes, float(np.mean(np.abs(found - total) / total)), float(np.mean(of_slope)))
+
+    errors = [error(rule, nodes, rule) for nodes in (32, 64, 128) for rule in rules.RULES]
+    with mock.patch.object(rules, "quadrature", uniform):
+        return errors + [error("uniform", nodes, "cosine") for nodes in (64, 256, 1024)]
+
+
+def rule_table(errors: list[RuleError]) -> str:
+    rows = [(e.rule, str(e.nodes), f"{100 * e.total:.2f} %", f"{100 * e.gradient:.2f} %") for e in errors]
+    title = f"{errors[0].problem}: errors of quadrature rules against {FINE} nodes"
+    return table(title, ("rule", "nodes", "total", "gradient"), rows)
 
 
 def uniform(_rule: str, nodes: int, _shift: float = 0.0) -> tuple[Array, Array]:
-    """What the losses do not offer: equal distances, ends included, equal weights."""
+    """Return nodes at equal distances, ends included, with equal weights."""
     return np.linspace(0, 1, nodes), np.full(nodes, 1 / nodes)
 
 
-def results(cases: list[Case], points: int) -> dict[str, Any]:
+def results(cases: list[Case], points: int, errors: list[list[RuleError]]) -> dict[str, Any]:
     return {
         "points": points,
+        "rules": [vars(error) for each in errors for error in each],
         "cases": [
             {
                 "problem": case.problem,
@@ -200,8 +207,9 @@ def main() -> None:
         progress(f"repetition {number + 1} of {options.repeat}")
         for case in cases:
             case.measure()
-    tables = [speed_table(cases, points), *(rule_table(problem, draw_plans(problem, 64)) for problem in PROBLEMS)]
-    report(results(cases, points), tables, as_json=options.json)
+    errors = [rule_errors(problem, draw_plans(problem, 64)) for problem in PROBLEMS]
+    tables = [speed_table(cases, points), *map(rule_table, errors)]
+    report(results(cases, points, errors), tables, as_json=options.json)
 
 
 if __name__ == "__main__":
