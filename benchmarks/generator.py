@@ -17,7 +17,8 @@ from common import arguments, median, progress, report, table, verdict
 from cnpgen.describe import kind_name
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import load_pipeline
-from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.pipelines.stage import BLOCK_ROWS
 from cnpgen.pipelines.stage import Batch, Run, Stage
 
 PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object")

@@ -1,35 +1,39 @@
-"""Making datasets: the plan, the pool of workers, the shards, the manifest."""
+"""Making datasets: the plan, what is there already, sharing out the rest, the manifest."""
 
-import hashlib
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.library import choose_backend
+from cnpgen.certification import certified
+from cnpgen.errors import UsageError
 from cnpgen.library import load_dataset_recipe
-from cnpgen.make_shard import Job, make_shard, versions
+from cnpgen.make_plan import dataset_folder, plan_dataset
+from cnpgen.make_shard import Job, make_shards
 from cnpgen.outcome import Outcome
-from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
-from cnpgen.recipes import DatasetRecipe, recipe_digest, resolved, split_rows
-from cnpgen.store.layout import MANIFEST, PLAN
+from cnpgen.recipes import DatasetRecipe
+from cnpgen.store.check import check_documents
+from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize
-from cnpgen.store.plan import DatasetPlan, ShardTask, default_shard_size, load_plan, shards
+from cnpgen.store.mending import discard, find_damaged, made_already
+from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.record import pending
-from cnpgen.store.workspace import clear_dataset, open_workspace
+from cnpgen.store.workspace import check_place, clear_dataset, open_workspace
+from cnpgen.workers import share_out, worker_count
 
-MAX_ROWS = 10**12
 ALONE = {
     "compiled": 200_000,
     "numpy": 20_000,
     "casadi": 5_000,
 }  # rows up to which a second process is not worth its start
+RUN_BLOCKS = 8  # blocks that a worker makes shards from before it is given others
+RUNS = 4  # at least, for every worker, where there are enough blocks: so that none waits long for the last one
 
-Progress = Callable[[int, Outcome], None]  # called with the rows and the outcome of every shard that is finished
-Begin = Callable[[Path, int, int], None]  # called once with the folder, the rows wanted and those already there
+Begin = Callable[[str, Path, int, int], None]  # called with "checking" or "making", the folder, the rows, those there
+Progress = Callable[[int, Outcome | None], None]  # called with the rows of a shard and, where it was made, its outcome
 
 
 @dataclass(frozen=True)
@@ -41,12 +45,16 @@ class MadeDataset:
         plan: Its plan.
         made: Rows made by this call.
         complete: Whether every shard is there and the manifest is written.
+        rows: Split -> rows that this call was about: all, or those of its part.
+        mended: Files that were damaged and are made again.
     """
 
     folder: Path
     plan: DatasetPlan
     made: int
     complete: bool
+    rows: Mapping[str, int] = field(default_factory=dict)
+    mended: tuple[str, ...] = ()
 
 
 def make_dataset(
@@ -59,6 +67,7 @@ def make_dataset(
     shard_size: int | None = None,
     dtype: str = "float64",
     backend: str | None = None,
+    certify: bool = False,
     force: bool = False,
     part: tuple[int, int] | None = None,
     begin: Begin | None = None,
@@ -66,6 +75,7 @@ def make_dataset(
 ) -> MadeDataset:
     """Make a dataset, or finish one that was interrupted.
 
+    What is there already is compared with its recorded sha256; what is damaged is made again, after a warning.
     Workers run on joblib: its default is one process per core; inside ``joblib.parallel_config(backend="dask")`` or
     any other registered backend they run there.
 
@@ -79,11 +89,13 @@ def make_dataset(
         shard_size: Rows per shard; default between 8192 and 65536.
         dtype: "float64" or "float32", what rows are stored as and validated as.
         backend: "compiled", "numpy" or "casadi"; default the fastest that works.
+        certify: Whether to plan every sample and keep those with a valid plan, with the plan (about 30 ms a sample).
         force: Whether to delete another dataset that is in the folder.
-        part: ``(k, m)``: make only every m-th shard, beginning with the k-th, for arrays of batch jobs; whoever finds
-            all shards there finishes the dataset.
-        begin: Called once with (folder, rows that this call is about, rows of them that are there already).
-        progress: Called with (rows, outcome) of every finished shard.
+        part: ``(k, m)``: make only the k-th of m parts of the shards, counted from 0, for arrays of batch jobs; whoever
+            finds all shards there finishes the dataset.
+        begin: Called with ("checking", folder, rows that are there, 0) before rows are compared, if there are any, and
+            with ("making", folder, rows that this call is about, rows of them that are there) before rows are made.
+        progress: Called with (rows, outcome) of every shard that was made, and (rows, None) of every one compared.
 
     Raises:
         RecipeError: The recipe has mistakes.
@@ -93,6 +105,8 @@ def make_dataset(
     """
     _check(workers, part, force=force)
     loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
+    loaded = certified(loaded) if certify else loaded
+    check_place(dataset_folder(loaded, out))
     job = plan_dataset(
         loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=not force
     )
@@ -100,118 +114,92 @@ def make_dataset(
         clear_dataset(job.folder)
     open_workspace(job.folder, job.plan)
     job = replace(job, plan=load_plan(job.folder))  # begun perhaps by another version: shards say what the plan says
-    k, m = part or (0, 1)
-    mine = shards(job.plan)[k::m]
-    waiting = set(pending(job.folder, job.plan))
-    tasks = [task for task in mine if task in waiting]
+    mine = _part(shards(job.plan), part)
+    waiting, damaged = _take_stock(job, mine, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in mine)
-        begin(job.folder, rows, rows - sum(task.rows for task in tasks))
-    if workers is None and sum(task.rows for task in tasks) <= ALONE[job.backend]:
-        workers = 1
+        begin("making", job.folder, rows, rows - sum(task.rows for task in waiting))
     made = 0
-    with closing(_run(job, tasks, worker_count(workers, len(tasks)))) as results:
+    with closing(_make(job, waiting, workers)) as results:
         for rows, outcome in results:
             made += rows
             if progress is not None:
                 progress(rows, outcome)
-    complete = not pending(job.folder, job.plan)
-    if complete and not (made == 0 and (job.folder / MANIFEST).exists()):
-        finalize(job.folder, notes=_notes(loaded))
-    return MadeDataset(job.folder, job.plan, made, complete)
+    complete, documents = _finish(job, _notes(loaded), made)
+    rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.plan.splits}
+    return MadeDataset(job.folder, job.plan, made, complete, rows_of, (*damaged, *documents))
 
 
-def plan_dataset(
-    recipe: str | Path | DatasetRecipe,
-    out: str | Path | None = None,
-    *,
-    n: int | None = None,
-    seed: int | None = None,
-    shard_size: int | None = None,
-    dtype: str = "float64",
-    backend: str | None = None,
-    resume: bool = False,
-) -> Job:
-    """Resolve what ``make_dataset`` would make, building its kernels but writing nothing of the dataset.
+def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
+    """Return one part of the shards; neighbours, which may share a block, stay together."""
+    k, m = part or (0, 1)
+    return tasks[k * len(tasks) // m : (k + 1) * len(tasks) // m]
 
-    With ``resume``, backend and shard size that are not given are those of the plan that is in the folder already.
 
-    Raises:
-        RecipeError: The recipe has mistakes.
-        UsageError: An argument makes no sense.
-        MachineError: No working backend.
-    """
-    loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
-    total = sum(loaded.splits.values()) if n is None else n
-    if not 1 <= total <= MAX_ROWS:
-        raise UsageError(f"n must be between 1 and {MAX_ROWS}, got {total}")
-    folder = Path(out) if out is not None else Path(f"{loaded.name}-v{loaded.version.split('.')[0]}")
-    if resume and (folder / PLAN).is_file():
-        begun = load_plan(folder)
-        backend = begun.backend if backend is None else backend
-        shard_size = begun.shard_size if shard_size is None else shard_size
-    chosen, cache_folder = choose_backend(backend)
-    prepared = PreparedPipeline(loaded.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
-    plan = DatasetPlan(
-        name=loaded.name,
-        version=loaded.version,
-        title=loaded.title,
-        license=loaded.license,
-        recipe_sha256=recipe_digest(loaded),
-        recipe=resolved(loaded),
-        seed=loaded.seed if seed is None else seed,
-        splits=split_rows(loaded, total),
-        shard_size=default_shard_size(total) if shard_size is None else shard_size,
-        block_rows=BLOCK_ROWS,
-        dtype=dtype,
-        backend=chosen,
-        fields=prepared.fields,
-        robot=_robot_record(prepared),
-        versions=versions(),
+def _take_stock(
+    job: Job, tasks: list[ShardTask], begin: Begin | None, progress: Progress | None
+) -> tuple[list[ShardTask], list[str]]:
+    """Compare the shards that are there with their records; return those to be made, and which files were damaged."""
+    there = made_already(job.folder, tasks)
+    if there and begin is not None:
+        begin("checking", job.folder, sum(task.rows for task in there), 0)
+    damaged = find_damaged(
+        job.folder, job.plan, there, progress=lambda task: progress(task.rows, None) if progress is not None else None
     )
-    return Job(folder, plan, loaded.pipeline, chosen, cache_folder)
+    if damaged:
+        first = next(iter(damaged.values()))
+        count = f"{len(damaged)} shards are damaged and are" if len(damaged) > 1 else "a shard is damaged and is"
+        warnings.warn(f"{count} made again: {first}", RuntimeWarning, stacklevel=3)
+        discard(job.folder, list(damaged))
+    sound = set(there) - set(damaged)
+    return [task for task in tasks if task not in sound], [task.file for task in damaged]
 
 
-def _run(job: Job, tasks: list[ShardTask], workers: int) -> Generator[tuple[int, Outcome], None, None]:
-    """Run the tasks and yield their results as they come."""
-    if not tasks:
-        return
+def _make(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Outcome], None, None]:
+    """Make the shards and yield what became of them as they are committed."""
+    if workers is None and sum(task.rows for task in tasks) <= ALONE[job.backend]:
+        workers = 1
+    workers = worker_count(workers, len(tasks))
+    groups = runs(job.plan, tasks, workers)
     if workers == 1:
-        for task in tasks:
-            yield make_shard(job, task)
+        for group in groups:
+            yield from make_shards(job, group)
         return
-    from joblib import Parallel, delayed
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    run = Parallel(n_jobs=workers, return_as="generator_unordered", pre_dispatch="2*n_jobs", batch_size=1)
-    results = run(delayed(make_shard)(job, task) for task in tasks)
-    try:
-        for result in results:  # noqa: UP028 - closing this generator must not close that one noisily
-            yield result
-    except BrokenProcessPool as error:
-        raise MachineError(
-            f"a worker died (killed, or out of memory): the shards that are finished are safe in {job.folder};"
-            " run the same command again to go on"
-        ) from error
-    finally:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that tasks under way are cancelled is the point
-            results.close()
+    advice = f": the shards that are finished are safe in {job.folder}; run the same command again to go on"
+    with closing(share_out(partial(_made, job), groups, workers, advice=advice)) as results:
+        for made in results:
+            yield from made
 
 
-def worker_count(workers: int | None, tasks: int) -> int:
-    """Decide how many processes share the tasks: what was asked for, else one per available core.
+def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Outcome]]:
+    """Make the shards of a run; what a worker does."""
+    return list(make_shards(job, tasks))
 
-    Raises:
-        UsageError: Fewer than one was asked for.
-    """
-    if workers is None:
-        from joblib import effective_n_jobs
 
-        return max(1, min(int(effective_n_jobs(-1)), tasks))  # of the backend that parallel_config names, if any
-    if workers < 1:
-        raise UsageError(f"workers must be at least 1, got {workers}")
-    return max(1, min(workers, tasks))
+def runs(plan: DatasetPlan, tasks: list[ShardTask], workers: int) -> list[list[ShardTask]]:
+    """Group shards that one worker makes one after the other, so that blocks which they share are made once."""
+    if plan.shard_size % plan.block_rows == 0:
+        return [[task] for task in tasks]  # these share none
+    blocks = RUN_BLOCKS
+    if workers > 1:
+        blocks = min(max(sum(task.rows for task in tasks) // (RUNS * workers * plan.block_rows), 1), blocks)
+    rows = plan.block_rows * blocks
+    return [list(group) for _, group in groupby(tasks, key=lambda task: (task.split, task.first_row // rows))]
+
+
+def _finish(job: Job, notes: str, made: int) -> tuple[bool, list[str]]:
+    """Write the documents of a dataset whose shards are all there; return whether they are, and what was damaged."""
+    if pending(job.folder, job.plan):
+        return False, []
+    damaged: list[str] = []
+    if made == 0 and (job.folder / MANIFEST).exists():
+        findings = check_documents(job.folder, job.plan)
+        if not findings:
+            return True, []
+        damaged = list(dict.fromkeys(finding.file for finding in findings))
+        warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
+    finalize(job.folder, notes=notes)
+    return True, damaged
 
 
 def _check(workers: int | None, part: tuple[int, int] | None, *, force: bool) -> None:
@@ -228,20 +216,3 @@ def _notes(recipe: DatasetRecipe) -> str:
     """Return the data card that is kept beside the dataset's recipe."""
     card = recipe.path.with_suffix(".md")
     return card.read_text(encoding="utf-8") if card.is_file() else ""
-
-
-def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
-    robot = prepared.context.robot
-    limits = {
-        name: [float(x) for x in getattr(robot, name)]
-        for name in ("position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
-    }
-    urdf = robot.urdf.read_bytes()
-    return {
-        "name": robot.urdf.stem,
-        "urdf_sha256": hashlib.sha256(urdf).hexdigest(),
-        "urdf": urdf.decode(),
-        "tip": robot.tip,
-        "joint_names": list(robot.joint_names),
-        "limits": limits,
-    }

@@ -1,7 +1,8 @@
-"""Making one shard: its blocks, the spot check by Pinocchio and Coal, the commit."""
+"""Making shards: their blocks, the spot check by Pinocchio and Coal, the commit."""
 
 import platform
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -14,12 +15,16 @@ from numpy.typing import NDArray
 
 from cnpgen import __version__
 from cnpgen.errors import MachineError
+from cnpgen.fields import Field
 from cnpgen.kernels.library import Backend
 from cnpgen.outcome import Outcome, merge_outcomes
-from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
+from cnpgen.pipelines.piece import Block
+from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import Pipeline
 from cnpgen.store.plan import DatasetPlan, ShardTask
 from cnpgen.store.record import commit_shard
+from cnpgen.store.shard import storage_dtype
+from cnpgen.store.workspace import require_plan
 
 SPOT_CHECKS = 32  # rows of every shard that Pinocchio and Coal recompute before it is written
 
@@ -43,56 +48,89 @@ class Job:
     cache_folder: Path
 
 
-def shard_columns(
-    prepared: PreparedPipeline, plan: DatasetPlan, task: ShardTask
-) -> tuple[dict[str, NDArray[Any]], Outcome]:
-    """Make the rows of a shard from its blocks.
+def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Outcome]]:
+    """Make, check and commit shards of one split; running it twice is harmless.
 
-    Returns:
-        ``(columns, outcome)``: field name -> values as stored, shape (rows, width) or (rows,).
-    """
-    stop = task.first_row + task.rows
-    parts, outcomes = [], []
-    for index in range(task.first_row // BLOCK_ROWS, -(-stop // BLOCK_ROWS)):
-        begin = index * BLOCK_ROWS
-        block = prepared.block(
-            plan.seed, task.split, index, first=max(task.first_row - begin, 0), stop=min(stop - begin, BLOCK_ROWS)
-        )
-        parts.append(block.columns)
-        outcomes.append(block.outcome)
-    columns: dict[str, NDArray[Any]] = {}
-    for field in plan.fields:
-        rows = np.concatenate([part[field.name] for part in parts], axis=1).T
-        stored = np.ascontiguousarray(
-            rows if field.width else rows[:, 0], "<i8" if field.dtype == "int64" else plan.dtype
-        )
-        columns[field.name] = stored
-    return columns, merge_outcomes(outcomes)
+    Args:
+        job: What is made.
+        tasks: The shards, in order; blocks that they share are made once.
 
+    Yields:
+        The rows of every shard and the fates of its draws, once it is committed.
 
-def make_shard(job: Job, task: ShardTask) -> tuple[int, Outcome]:
-    """Make, check and commit one shard; running it twice is harmless.
-
-    Returns:
-        Its rows and the fates of its draws.
+    Raises:
+        RecipeError: Practically no draw is accepted.
+        MachineError: The disk or the backend fails.
+        UsageError: The folder was given to another dataset meanwhile.
     """
     started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     prepared = _prepared(job)
-    columns, outcome = shard_columns(prepared, job.plan, task)
-    worst = spot_check(prepared, columns, job.plan, task)
-    outcome = replace(outcome, verification=worst)
-    seconds = round(time.perf_counter() - clock, 3)
-    commit_shard(
-        job.folder,
-        job.plan,
-        task,
-        columns=columns,
-        outcome=outcome,
-        started=started,
-        seconds=seconds,
-        versions=versions(),
-    )
-    return task.rows, outcome
+    for task, (columns, outcome) in zip(tasks, shard_columns(prepared, job.plan, tasks), strict=True):
+        found = replace(outcome, verification=spot_check(prepared, columns, job.plan, task))
+        require_plan(job.folder, job.plan)
+        seconds = round(time.perf_counter() - clock, 3)
+        commit_shard(
+            job.folder,
+            job.plan,
+            task,
+            columns=columns,
+            outcome=found,
+            started=started,
+            seconds=seconds,
+            versions=versions(),
+        )
+        started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
+        yield task.rows, found
+
+
+def shard_columns(
+    prepared: PreparedPipeline, plan: DatasetPlan, tasks: Sequence[ShardTask]
+) -> Iterator[tuple[dict[str, NDArray[Any]], Outcome]]:
+    """Make the rows of shards of one split from its blocks, each of which is made once.
+
+    Args:
+        prepared: The stages.
+        plan: The dataset.
+        tasks: The shards, in order.
+
+    Yields:
+        ``(columns, outcome)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,), and the
+        fates of the draws.
+    """
+    pieces = _pieces(prepared, plan.seed, tasks)
+    for task in tasks:
+        parts: list[Block] = []
+        while sum(part.columns["sample_id"].shape[1] for part in parts) < task.rows:
+            parts.append(next(pieces))
+        columns = {
+            field.name: _stored([part.columns[field.name] for part in parts], field, plan) for field in plan.fields
+        }
+        yield columns, merge_outcomes([part.outcome for part in parts])
+
+
+def _pieces(prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]) -> Iterator[Block]:
+    """Make the blocks that shards have rows of, in pieces that belong to one shard each."""
+    size = prepared.block_rows
+    blocks = {index for task in tasks for index in blocks_of(task, size)}
+    for index in sorted(blocks):
+        begin = index * size
+        ranges = [
+            (max(task.first_row - begin, 0), min(task.first_row + task.rows - begin, size))
+            for task in tasks
+            if index in blocks_of(task, size)
+        ]
+        yield from prepared.pieces(seed, tasks[0].split, index, ranges)
+
+
+def blocks_of(task: ShardTask, size: int) -> range:
+    """List the blocks of ``size`` rows that a shard has rows of."""
+    return range(task.first_row // size, (task.first_row + task.rows - 1) // size + 1)
+
+
+def _stored(parts: list[NDArray[Any]], field: Field, plan: DatasetPlan) -> NDArray[Any]:
+    """Join pieces of shape (width, rows) to what is stored of a field, shape (rows, width) or (rows,)."""
+    rows = np.concatenate(parts, axis=1).T
+    return np.ascontiguousarray(rows if field.width else rows[:, 0], storage_dtype(field, plan.dtype))
 
 
 def spot_check(

@@ -37,6 +37,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "braking-reach": "cnpgen.pipelines.braking:BrakingReach",
         "collision": "cnpgen.pipelines.collision:Collision",
         "gravity-torque": "cnpgen.pipelines.torque:GravityTorque",
+        "certified-plan": "cnpgen.certification:CertifiedPlan",
     },
     CONSTRAINTS: {
         "joint-position": "cnpgen.constraints.joint:JointPosition",

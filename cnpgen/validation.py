@@ -2,8 +2,9 @@
 
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +15,20 @@ from cnpgen.consistency import check_recipe, check_statistics
 from cnpgen.errors import CnpgenError, DatasetError, MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.library import restore_dataset_recipe
-from cnpgen.make import worker_count
-from cnpgen.make_shard import shard_columns, versions
-from cnpgen.pipelines.prepared import BLOCK_ROWS, PreparedPipeline
+from cnpgen.make_shard import blocks_of, shard_columns, versions
+from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest
 from cnpgen.robots.robot import load_robot
 from cnpgen.shard_checks import check_numbers
-from cnpgen.store.check import Finding, check_dataset
+from cnpgen.store.check import DELETE, Finding, check_dataset
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.reader import StoredDataset
 from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.verify.report import RowReport, merge
 from cnpgen.verify.rows import verify_rows
+from cnpgen.wording import counted
+from cnpgen.workers import share_out, worker_count
 
 PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
 PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32
@@ -65,7 +67,8 @@ class ValidationReport:
             "ok": self.ok,
             "rows": self.rows,
             "findings": [
-                {"file": finding.file, "problem": finding.problem, "note": finding.note} for finding in self.findings
+                {"file": item.file, "problem": item.problem, "note": item.note, "advice": item.advice}
+                for item in self.findings
             ],
             "deep": self.deep.to_dict() if self.deep else None,
             "regenerated": self.regenerated,
@@ -75,17 +78,20 @@ class ValidationReport:
     def summary(self) -> str:
         """Say in a few lines what was checked and what came out."""
         wrong = sum(not finding.note for finding in self.findings)
-        lines = [f"{self.folder}: {self.rows:,} rows, {wrong or 'no'} finding{'s' if wrong != 1 else ''}"]
+        lines = [f"{self.folder}: {counted(self.rows, 'row')}, {counted(wrong, 'finding') if wrong else 'no findings'}"]
         if self.deep:
-            lines.append(f"  recomputed with Pinocchio and Coal: {self.deep.rows:,} rows, {len(self.deep.out):,} out")
+            lines.append(
+                f"  recomputed with Pinocchio and Coal: {counted(self.deep.rows, 'row')}, {len(self.deep.out):,} out"
+            )
             lines += [
                 f"    {check.name:<22} worst {check.worst:9.2e} of {check.allowed:9.2e} {check.unit:<8}"
                 f" {check.rows_out} rows out"
                 for check in self.deep.checks
             ]
         if self.regenerated:
-            lines.append(f"  made again: {self.regenerated} blocks, {self.identical} identical to the bit")
-        return "\n".join(lines)
+            lines.append(f"  made again: {counted(self.regenerated, 'block')}, {self.identical} identical to the bit")
+        advice = dict.fromkeys(finding.advice for finding in self.findings if finding.advice and not finding.note)
+        return "\n".join([*lines, *(f"  what to do: {text}" for text in advice)])
 
 
 def validate_dataset(
@@ -149,17 +155,15 @@ def _deep(
     folder: Path, plan: DatasetPlan, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
 ) -> tuple[RowReport | None, list[Finding]]:
     """Recompute every row, shard by shard."""
-    from joblib import Parallel, delayed
-
     reports, findings, keys = [], [], [np.empty(0, np.uint64)]
-    run = Parallel(n_jobs=workers, return_as="generator", batch_size=1)
-    for task, result in zip(tasks, run(delayed(_verify_shard)(folder, plan, task) for task in tasks), strict=True):
-        findings += [Finding(task.file, problem) for problem in result.problems]
-        if result.report is not None:
-            reports.append(result.report)
-        keys.append(result.keys)
-        if progress is not None:
-            progress(task.rows)
+    with closing(share_out(partial(_verify_shard, folder, plan), tasks, workers, ordered=True)) as results:
+        for task, result in zip(tasks, results, strict=True):
+            findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
+            if result.report is not None:
+                reports.append(result.report)
+            keys.append(result.keys)
+            if progress is not None:
+                progress(task.rows)
     every = np.concatenate(keys)
     twice = len(every) - len(np.unique(every))
     if twice:
@@ -206,30 +210,26 @@ def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardChe
 
 def _regenerate(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> tuple[int, int, list[Finding]]:
     """Make random blocks again; return how many, how many of them are the same to the bit, and what differs."""
-    if plan.block_rows != BLOCK_ROWS:
-        raise UsageError(f"the blocks of {folder} have {plan.block_rows} rows, those of this version {BLOCK_ROWS}")
-    pieces = [(task, block) for task in tasks for block in _blocks(task)]
+    size = plan.block_rows
+    pieces = [(task, block) for task in tasks for block in blocks_of(task, size)]
     backend, cache_folder = _backend(folder, plan)
     dataset = StoredDataset(folder, plan, None)  # whatever became of the manifest
     chosen = np.random.default_rng().permutation(len(pieces))[:count]
     identical, findings = 0, []
     with restored(plan) as recipe:
         prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=plan.dtype)
+        if prepared.block_rows != size:
+            raise UsageError(f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}")
         for task, block in (pieces[index] for index in chosen):
-            start = max(block * BLOCK_ROWS, task.first_row)
-            stop = min((block + 1) * BLOCK_ROWS, task.first_row + task.rows)
-            again, _ = shard_columns(prepared, plan, ShardTask(task.split, task.index, start, stop - start))
+            start = max(block * size, task.first_row)
+            stop = min((block + 1) * size, task.first_row + task.rows)
+            again, _ = next(shard_columns(prepared, plan, [ShardTask(task.split, task.index, start, stop - start)]))
             same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
             identical += same
             if problem:
                 text = f"block {block} made again from the seed: {problem}{_explanation(plan, recipe)}"
                 findings.append(Finding(task.file, text))
     return len(chosen), identical, findings
-
-
-def _blocks(task: ShardTask) -> range:
-    """List the blocks that a shard has rows of."""
-    return range(task.first_row // BLOCK_ROWS, (task.first_row + task.rows - 1) // BLOCK_ROWS + 1)
 
 
 def _backend(folder: Path, plan: DatasetPlan) -> tuple[Backend, Path]:

@@ -12,7 +12,8 @@ PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
 # Layers from the top of docs/architecture.md downwards; a module may import those of its own layer and above.
 LAYERS = (
-    ("errors", "units", "fields", "outcome"),
+    ("errors", "units", "fields", "outcome", "wording", "threads"),
+    ("workers",),
     ("schema",),
     ("constraints", "pipelines.stage"),
     ("plugins",),
@@ -22,9 +23,9 @@ LAYERS = (
     ("pipelines",),
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
-    ("interop",),
+    ("interop", "certification"),
     ("make_shard", "make", "validation", "consistency", "shard_checks", "inspection", "describe", "plots", "doctor"),
-    ("evaluation",),
+    ("evaluation", "refinement", "solving"),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.

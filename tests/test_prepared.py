@@ -11,7 +11,9 @@ from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.outcome import Outcome, merge_outcomes
 from cnpgen.pipelines.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.prepared import BLOCK_ROWS, Block, PreparedPipeline, as_stored, random_generator
+from cnpgen.pipelines.piece import Block
+from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
+from cnpgen.pipelines.stage import BLOCK_ROWS
 from cnpgen.pipelines.stage import Batch
 
 CLOSE = 1e-9  # SI: what backends may differ by

@@ -13,16 +13,33 @@ from typing import Any, NoReturn
 
 from cnpgen.cli import (
     doctor_command,
+    evaluate_command,
+    export_command,
     inspect_command,
     list_command,
     make_command,
+    refine_command,
     show_command,
+    solve_command,
     validate_command,
 )
+from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
+from cnpgen.threads import prefer_one_thread
 
-_COMMANDS = (make_command, list_command, show_command, inspect_command, validate_command, doctor_command)
+_COMMANDS = (
+    make_command,
+    list_command,
+    show_command,
+    inspect_command,
+    validate_command,
+    solve_command,
+    refine_command,
+    evaluate_command,
+    export_command,
+    doctor_command,
+)
 
 _DESCRIPTION = "Make, inspect and prove datasets of boundary problems for kinodynamic motion planning."
 
@@ -32,17 +49,22 @@ examples:
   cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
   cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
   cnpgen validate airhockey-hit-v1 --deep            prove them with Pinocchio and Coal
+  cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
+  cnpgen refine plans.h5 -o better.h5                polish anyone's plans
+  cnpgen evaluate plans.h5 --plot plan.png           judge plans with them
+  cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
 
 stdout is data, stderr everything else. Exit codes:
   0    done
-  1    the answer is no: the dataset is damaged, unfinished or not valid
+  1    the answer is no: a dataset or a file is damaged or unfinished, rows or plans are not valid
   2    a wrong argument or a mistake in a recipe
   3    the machine: no compiler, a full disk, a broken library; also an internal error of cnpgen
-  130  interrupted; finished shards are kept, the same command goes on
+  130  interrupted (Ctrl-C); finished shards and plans are kept, the same command goes on
   141  whoever read stdout went away
+  143  terminated (SIGTERM, as SLURM and Docker send it); likewise resumable
 """
 
-INTERRUPTED, NOBODY_READS = 130, 141  # 128 + SIGINT, 128 + SIGPIPE, as shells have it
+NOBODY_READS = 141  # 128 + SIGPIPE, as shells have it
 
 
 class _Version(argparse.Action):
@@ -68,10 +90,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code, as ``cnpgen --help`` lists them.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    prefer_one_thread()
     _prepare_streams()
     with _warnings_on_one_line():
         try:
-            code = _run(words)
+            with interruptible():
+                code = _run(words)
             sys.stdout.flush()
         except BrokenPipeError:
             return _leave_pipe()
@@ -112,8 +136,9 @@ def build_parser() -> Parser:
 def _report(error: BaseException) -> int:
     """Print an error as one line per mistake; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
-        print("cnpgen: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        what = "terminated" if isinstance(error, Terminated) else "interrupted"
+        print(f"cnpgen: {what}: {error}" if str(error) else f"cnpgen: {what}", file=sys.stderr)
+        return exit_code(error)
     lines, code = _explain(error)
     for line in lines:
         print(f"cnpgen: error: {line}", file=sys.stderr)
@@ -161,5 +186,6 @@ def _warnings_on_one_line() -> Iterator[None]:
         print(f"cnpgen: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
     with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # joblib without pgrep; it kills them anyhow
         warnings.showwarning = show
         yield

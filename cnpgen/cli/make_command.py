@@ -2,24 +2,34 @@
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
+from cnpgen.cli.interruption import raise_if_interrupted
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.progress import Meter
+from cnpgen.wording import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from cnpgen.make import MadeDataset
     from cnpgen.outcome import Outcome
     from cnpgen.recipes import DatasetRecipe
 
-INTERRUPTED = "interrupted: finished shards are kept, run the same command again to go on"
+KEPT = "finished shards are kept, run the same command again to go on"
 
 _TEXT = """\
 The same recipe, seed and backend give the same rows, however the work is shared out: --workers, --shard-size and
 --part decide which process makes which rows, never what is in them; a smaller --n gives the first rows of each split.
+With --certify every sample is planned from nothing (about 30 ms each): those without a valid plan are left out and
+counted under "no plan found", and the plan's control points are stored beside the others.
 The folder of the dataset is printed on stdout.
+
+What is in the folder already is kept if it is of the same dataset: its shards are read and compared with their
+recorded sha256 (about 300 MB/s per core), and damaged ones are made again. Another dataset is replaced only with
+--force, or if it has no rows yet. After Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command
+goes on.
 """
 
 
@@ -30,7 +40,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
     option("--n", metavar="N", type=values.rows, help="rows of all splits together; default the recipe's")
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
-    option("--out", metavar="DIR", type=Path, help="folder of the dataset; default NAME-vMAJOR here")
+    option("--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--shard-size", metavar="R", type=values.positive, help="rows per file (default: 8192 to 65536)")
     option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
@@ -38,6 +48,7 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "--part", metavar="K/M", type=values.part, help="make the K-th of M parts only (0/M to M-1/M), for job arrays"
     )
+    option("--certify", action="store_true", help="plan every sample, and keep those with a valid plan, with the plan")
     option("--force", action="store_true", help="replace another dataset that is in the folder")
     option("--dry-run", action="store_true", help="print what would be made, and write nothing")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -48,6 +59,10 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.library import load_dataset_recipe
 
     recipe = load_dataset_recipe(arguments.recipe)
+    if arguments.certify:
+        from cnpgen.certification import certified
+
+        recipe = certified(recipe)
     if arguments.dry_run:
         from cnpgen.cli.plan_text import plan_text
 
@@ -55,9 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     try:
         _make(recipe, arguments)
-    except KeyboardInterrupt:
-        print(f"cnpgen: {INTERRUPTED}", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as interruption:
+        raise type(interruption)(KEPT) from interruption
     return 0
 
 
@@ -70,6 +84,11 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
     from cnpgen.make import make_dataset
 
     meter = Meter(quiet=arguments.quiet)
+
+    def count(rows: int, outcome: "Outcome | None") -> None:
+        raise_if_interrupted()
+        meter(rows, outcome)
+
     try:
         made = make_dataset(
             recipe,
@@ -82,30 +101,39 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
             backend=arguments.backend,
             force=arguments.force,
             part=arguments.part,
-            begin=lambda folder, total, there: meter.begin(f"making {folder}", total, there),
-            progress=meter,
+            begin=lambda step, folder, total, there: meter.begin(f"{step} {folder}", total, there),
+            progress=count,
         )
     finally:
         meter.close()
     if not arguments.quiet:
-        print("\n".join(_summary(made, meter)), file=sys.stderr)
+        print("\n".join(_summary(made, meter, arguments.part)), file=sys.stderr)
     print(made.folder)
 
 
-def _summary(made: "MadeDataset", meter: Meter) -> list[str]:
+def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) -> list[str]:
     """Say in a few lines what was done."""
     import textwrap
 
-    splits = ", ".join(f"{split} {rows:,}" for split, rows in made.plan.splits.items())
-    rows = sum(made.plan.splits.values())
-    total = f"{rows:,} rows ({splits})"
-    rest = "" if made.complete else "; other parts are still to be made"
+    wanted = sum(made.rows.values())
+    text, rest = _rows_text(made.rows), "" if made.complete else "; other parts are still to be made"
+    if part is not None:
+        all_rows = counted(sum(made.plan.splits.values()), "row")
+        text, rest = f"{text}, part {part[0]}/{part[1]} of {all_rows},", rest or "; all parts are made"
     if not made.made:
-        return [f"already {'complete' if made.complete else 'made, this part of'}: {total}{rest}"]
-    share = "" if made.made == rows else f"the last {made.made:,} of " if made.complete else f"{made.made:,} of "
-    speed = f"in {meter.seconds:.1f} s, {made.made / max(meter.seconds, 1e-9):,.0f} rows/s"
-    lines = [f"made {share}{total} {speed}{rest}", *([_yield(meter.outcome)] if meter.outcome else [])]
-    return [part for line in lines for part in textwrap.wrap(line, 100, subsequent_indent="  ")]
+        return [f"already {'made' if part else 'complete'}: {text.rstrip(',')}{rest}"]
+    share = "" if made.made == wanted else f"the missing {made.made:,} of "
+    whole, making = meter.seconds, max(meter.running, 1e-9)
+    times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
+    lines = [f"made {share}{text} {times}{rest}"]
+    lines += [_yield(meter.outcome)] if meter.outcome else []
+    return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
+
+
+def _rows_text(rows: "Mapping[str, int]") -> str:
+    """Write rows in all and by split, without empty splits."""
+    splits = ", ".join(f"{split} {number:,}" for split, number in rows.items() if number)
+    return counted(sum(rows.values()), "row") + (f" ({splits})" if splits else "")
 
 
 def _yield(outcome: "Outcome") -> str:

@@ -5,6 +5,8 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.wording import counted
+
 if TYPE_CHECKING:
     from cnpgen.outcome import Outcome
 
@@ -14,41 +16,55 @@ class Meter:
 
     Args:
         quiet: Whether to show nothing.
+        noun: What is counted.
 
     Attributes:
-        rows: Rows counted so far, without ``initial``.
+        rows: Rows counted since the last beginning, without ``initial``.
         outcome: The fates of their draws.
     """
 
-    def __init__(self, *, quiet: bool = False) -> None:
+    def __init__(self, *, quiet: bool = False, noun: str = "row") -> None:
         self.rows = 0
         self.outcome: Outcome | None = None
-        self._quiet = quiet
-        self._start = time.perf_counter()
+        self._quiet, self._noun = quiet, noun
+        self._start = self._begun = time.perf_counter()
         self._bar: Any = None
 
     def begin(self, title: str, total: int, initial: int = 0) -> None:
-        """Show that something begins.
+        """Show that something begins; what began before is over.
 
         Args:
             title: What is going on.
             total: Rows at the end.
             initial: Rows that are there already.
         """
+        self.close()
+        self.rows, self.outcome, self._begun = 0, None, time.perf_counter()
         if not self._quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
             self._bar = tqdm(
-                desc=title, total=total, initial=initial, unit="row", unit_scale=True, dynamic_ncols=True, leave=False
+                desc=title,
+                total=total,
+                initial=initial,
+                unit=self._noun,
+                unit_scale=True,
+                leave=False,
+                dynamic_ncols=True,
             )
         elif not self._quiet:
-            there = f", {initial:,} are there already" if initial else ""
-            print(f"{title}: {total:,} rows{there}", file=sys.stderr, flush=True)
+            there = f", {initial:,} there already" if initial else ""
+            print(f"{title}: {counted(total, self._noun)}{there}", file=sys.stderr, flush=True)
 
     @property
     def seconds(self) -> float:
         """Time since the meter was made [s]."""
         return time.perf_counter() - self._start
+
+    @property
+    def running(self) -> float:
+        """Time since the last beginning [s]."""
+        return time.perf_counter() - self._begun
 
     def __call__(self, rows: int, outcome: "Outcome | None" = None) -> None:
         """Count the rows of a shard."""
@@ -61,8 +77,14 @@ class Meter:
                 self._bar.set_postfix_str(f"{share:.1%} of draws accepted", refresh=False)
             self._bar.update(rows)
 
+    def note(self, text: str) -> None:
+        """Show a word beside the bar."""
+        if self._bar is not None:
+            self._bar.set_postfix_str(text, refresh=False)
+
     def close(self) -> None:
         """Remove the bar."""
         if self._bar is not None:
             with suppress(OSError):
                 self._bar.close()
+            self._bar = None

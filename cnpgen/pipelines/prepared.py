@@ -1,30 +1,24 @@
 """A pipeline ready to run: blocks of rows, each a pure function of (seed, split, block index)."""
 
 import hashlib
-import json
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen import plugins
 from cnpgen.constraints.constraint import EXACTNESS
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.fields import Field
-from cnpgen.kernels.library import Backend, KernelLibrary
-from cnpgen.outcome import Outcome
+from cnpgen.kernels.library import Backend, KernelLibrary, problem_identity
 from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run
-from cnpgen.pipelines.tally import Tally
-from cnpgen.recipes import Pipeline, Problem, resolved
+from cnpgen.pipelines.piece import Block, Piece
+from cnpgen.pipelines.stage import BLOCK_ROWS, Array, Batch, Run
+from cnpgen.recipes import Pipeline
 from cnpgen.robots.robot import load_robot
 
-BLOCK_ROWS = 4096
-LARGEST_ROUND = 8192
-SMALLEST_ROUND = 256
 HOPELESS = 1e-4  # acceptance below which a pipeline is given up, once it has had a fair chance
 FAIR_CHANCE = 100_000  # draws
 
@@ -33,19 +27,6 @@ ORDER = (
     "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq", "start_xyz", "goal_xyz",
     "hit_angle", "hit_speed", "hit_speed_max",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Block:
-    """Accepted rows, in draw order, and what became of every draw up to the last of them.
-
-    Attributes:
-        columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
-        outcome: Draws, rejections and densities.
-    """
-
-    columns: dict[str, NDArray[Any]]
-    outcome: Outcome
 
 
 class PreparedPipeline:
@@ -60,6 +41,7 @@ class PreparedPipeline:
     Attributes:
         context: Problem, robot and kernels.
         fields: The fields of a row, in stored order.
+        block_rows: Rows per block.
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
@@ -67,8 +49,9 @@ class PreparedPipeline:
             raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
         problem = pipeline.problem
         robot = load_robot(problem)
-        kernels = KernelLibrary(backend, cache_folder, _identity(problem), {"robot": robot, "problem": problem})
+        kernels = KernelLibrary(backend, cache_folder, problem_identity(problem), {"robot": robot, "problem": problem})
         self.pipeline = pipeline
+        self.block_rows = min(stage.block_rows for stage in pipeline.stage)
         self.context = Context(problem, robot, kernels, dtype)
         self.fields = _ordered_fields(pipeline, self.context)
         written = _check_needs(pipeline, self.context)
@@ -76,7 +59,7 @@ class PreparedPipeline:
             self._stages = _prepare(pipeline, self.context)
             self._accept = acceptance(self.context, written)
 
-    def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int = BLOCK_ROWS) -> Block:
+    def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
         """Make rows ``first`` to ``stop`` of one block.
 
         Args:
@@ -84,29 +67,40 @@ class PreparedPipeline:
             split: Name of the split.
             index: Index of the block in the split.
             first: First row wanted.
-            stop: One after the last row wanted, at most ``BLOCK_ROWS``.
+            stop: One after the last row wanted; by default, and at most, ``block_rows``.
+
+        Raises:
+            RecipeError: Practically no draw is accepted.
+        """
+        (block,) = self.pieces(seed, split, index, [(first, self.block_rows if stop is None else stop)])
+        return block
+
+    def pieces(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
+        """Make several ranges of rows of one block, drawing it only once.
+
+        Args:
+            seed: Root seed of the dataset.
+            split: Name of the split.
+            index: Index of the block in the split.
+            ranges: (first row, one after the last row) of every piece, ascending, not overlapping.
+
+        Yields:
+            Every piece as soon as it is whole.
 
         Raises:
             RecipeError: Practically no draw is accepted.
         """
         random = random_generator(seed, split, index)
-        tally, parts = Tally(self.fields), []
+        waiting = deque(Piece(self.fields, first, stop) for first, stop in ranges)
         made = tried = 0
-        while made < stop:
-            batch = self._round(random, _round_size(made, tried))
+        while waiting:
+            batch = self._round(random, self._round_size(made, tried))
             tried += batch.size
-            taken = batch.alive[: stop - made]
-            skip = min(max(first - made, 0), len(taken))
-            made += len(taken)
-            if made >= first:
-                attempts = tally.count(batch, taken, first=skip, last=made == stop)
-                part = {field.name: batch[field.name][:, skip : len(taken)] for field in self.fields[:-2]}
-                parts.append({**part, "attempts": attempts[None]})
-            if made < stop:
+            while waiting and waiting[0].take(batch, made):
+                yield waiting.popleft().block(index * self.block_rows)
+            made += len(batch.alive)
+            if waiting:
                 self._check_hope(batch, made, tried)
-        columns = {name: np.concatenate([part[name] for part in parts], axis=1) for name in parts[0]}
-        columns["sample_id"] = index * BLOCK_ROWS + np.arange(first, stop, dtype=np.int64)[None]
-        return Block(columns, tally.outcome())
 
     def _round(self, random: np.random.Generator, size: int) -> Batch:
         batch = Batch(size)
@@ -120,6 +114,19 @@ class PreparedPipeline:
         batch.stage = "acceptance"
         self._accept(batch, random)
         return batch
+
+    def _round_size(self, made: int, tried: int) -> int:
+        """How many draws the next round of a block has: what its own acceptance so far says is missing, and some more.
+
+        It depends on the block alone and not on how many of its rows are wanted.
+        """
+        rows = self.block_rows
+        if tried == 0:
+            return rows // 2
+        if made == 0:
+            return 2 * rows
+        missing = (rows - made) * tried / made
+        return int(np.clip(np.ceil(1.03 * missing) + rows // 128, rows // 16, 2 * rows))
 
     def _check_hope(self, batch: Batch, made: int, tried: int) -> None:
         if tried >= FAIR_CHANCE and made < HOPELESS * tried:
@@ -147,26 +154,6 @@ def as_stored(values: Array, field: Field) -> Array:
             stored = np.where(beyond(stored, limit), np.nextafter(stored, np.float32(inwards)), stored)
             rounded = np.where(beyond(rounded, limit) & ~beyond(values, limit), stored, rounded)
     return rounded.astype(np.float64)
-
-
-def _identity(problem: Problem) -> str:
-    """Digest of what kernels are built from: the problem as it is, wherever it came from, and its URDF."""
-    content = resolved(problem)
-    del content["title"], content["robot"]["urdf"]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode() + problem.urdf_path.read_bytes()).hexdigest()
-
-
-def _round_size(made: int, tried: int) -> int:
-    """How many draws the next round of a block has: what its own acceptance so far says is missing, and a little more.
-
-    It depends on the block alone and not on how many of its rows are wanted.
-    """
-    if tried == 0:
-        return BLOCK_ROWS // 2
-    if made == 0:
-        return LARGEST_ROUND
-    missing = (BLOCK_ROWS - made) * tried / made
-    return int(np.clip(np.ceil(1.03 * missing) + 32, SMALLEST_ROUND, LARGEST_ROUND))
 
 
 def _prepare(pipeline: Pipeline, context: Context) -> list[tuple[str, Run]]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+BLOCK_ROWS = 4096  # rows per block, unless a stage wants fewer
+
 
 class Batch:
     """A round of draws and the columns that are known of those still alive.
@@ -80,8 +82,10 @@ class Stage(ABC):
 
     Attributes:
         needs: Columns that earlier stages must have written.
+        block_rows: The largest blocks that rows may be made in; a stage that takes long for a row says less.
     """
 
+    block_rows: ClassVar[int] = BLOCK_ROWS
     needs: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod

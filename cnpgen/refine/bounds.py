@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.recipes import Problem
 from cnpgen.refine.sqp import Bounds
-from cnpgen.refine.transcription import residual_scale
+from cnpgen.refine.stage import residual_scale
 
 if TYPE_CHECKING:
     from cnpgen.verify.world import World
 
 Array = NDArray[np.float64]
+ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points
 EDGE = 0.05  # phase over which tightening fades in: boundary states may sit on a limit
 
 
@@ -54,6 +55,9 @@ class BoundsTemplate:
         self._lower = np.concatenate([low for low, _ in tables], axis=1)
         self._upper = np.concatenate([high for _, high in tables], axis=1)
         self._pairs = pairs
+        needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in pairs])
+        self._sharp = np.zeros(self._lower.shape, bool)
+        self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = needs == 2
 
     def of(self, start_tip: Array) -> Bounds:
         """Return the bounds of the motion that starts with the tip at ``start_tip`` [m], shape (3,)."""
@@ -68,7 +72,7 @@ class BoundsTemplate:
                 lower[:, column : column + width] -= wider[:, None] / scale
                 upper[:, column : column + width] += wider[:, None] / scale
             column += width
-        return Bounds(lower, upper)
+        return Bounds(lower, upper, self._sharp)
 
 
 def _scale(constraint: Constraint, condition: Condition) -> Array:

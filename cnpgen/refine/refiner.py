@@ -1,48 +1,32 @@
-"""Refining one plan: a cheap first pass, a polish on a finer grid where a fine check fails, other starts only then."""
+"""Refining one plan: a cheap first pass, a polish on a finer grid where a check fails, other starts only then."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.recipes import Problem
+from cnpgen.recipes import Problem, TrajectorySpec
 from cnpgen.refine import starts
+from cnpgen.refine.alternatives import minimise_with
 from cnpgen.refine.bounds import BoundsTemplate, Tightening
-from cnpgen.refine.sqp import Settings, minimise
-from cnpgen.refine.transcription import Grid, Transcription, make_grid, residual_scale, stage_jacobian, stage_values
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.refine.criterion import Criterion, criterion_residuals
+from cnpgen.refine.fine import FineCheck
+from cnpgen.refine.grid import make_grid
+from cnpgen.refine.sqp import DEFAULT, Result, Settings, minimise
+from cnpgen.refine.stage import stage_jacobian, stage_values
+from cnpgen.refine.task import Attempt, Outcome, Task
+from cnpgen.refine.transcription import Stage, Transcription
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
     from cnpgen.verify.world import World
 
 Array = NDArray[np.float64]
-FINE = 1000  # phases of the fine check
-
-
-class Outcome(IntEnum):
-    """How refining a plan ended."""
-
-    SOLVED = 0
-    POLISHED = 1
-    RESTARTED = 2
-    KEPT = 3
-    UNSOLVED = 4
-
-    @property
-    def text(self) -> str:
-        """The outcome in words."""
-        return {
-            Outcome.SOLVED: "solved in the first pass",
-            Outcome.POLISHED: "solved after a polish on a finer grid",
-            Outcome.RESTARTED: "solved from another start",
-            Outcome.KEPT: "kept as it was given: nothing better was found",
-            Outcome.UNSOLVED: "no plan within the tolerances was found; this is the best one",
-        }[self]
+WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 
 
 @dataclass(frozen=True)
@@ -54,146 +38,143 @@ class Pass:
     settings: Settings
 
 
-def default_passes(problem: Problem) -> tuple[Pass, Pass, Pass]:
-    """First pass, polish, other starts."""
+@dataclass(frozen=True)
+class Passes:
+    """The passes of a problem.
+
+    Attributes:
+        first: From a given plan or a straight line.
+        polish: On a finer grid, from where the first pass ended.
+        strict: The same with more room to every bound, where the verdict still finds something.
+        other: From other starts.
+    """
+
+    first: Pass
+    polish: Pass
+    strict: Pass
+    other: Pass
+
+
+def default_passes(problem: Problem, settings: Settings) -> Passes:
+    """Choose grids and tightening; obstacles need more room between the points of a grid."""
     crowded = bool(problem.obstacle)
-    first = Tightening(limit=4e-3 if crowded else 3e-3, gentle=1e-3 if crowded else 1e-4, clearance=1e-3, band=0.1)
-    finer = replace(first, limit=4e-3)
-    return (
-        Pass(128, first, Settings()),
-        Pass(256, finer, Settings(radius=0.1, max_iterations=20)),
-        Pass(192, finer, Settings(max_iterations=60)),
+    room = Tightening(limit=4e-3 if crowded else 3e-3, gentle=1e-3 if crowded else 1e-4, clearance=1e-3, band=0.09)
+    finer = replace(room, limit=4e-3)
+    strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05)
+    short = replace(settings, radius=WARM_RADIUS, max_iterations=settings.max_iterations // 2)
+    longer = replace(settings, max_iterations=settings.max_iterations * 3 // 2)
+    return Passes(
+        Pass(128, room, settings), Pass(256, finer, short), Pass(256, strict, short), Pass(192, finer, longer)
     )
 
 
-@dataclass(frozen=True)
-class Refined:
-    """A refined plan.
-
-    Attributes:
-        path: Path control points [rad], shape (C, n).
-        rate: Rate control points [1/s], shape (R,).
-        outcome: How it ended.
-        excess: Worst violation on the fine grid, as a multiple of what is allowed; at most 1 is within the tolerances.
-        iterations: Steps of all passes together.
-    """
-
-    path: Array
-    rate: Array
-    outcome: Outcome
-    excess: float
-    iterations: int
-
-
 class Refiner:
-    """Refines plans of one problem.
+    """Refines plans of one problem, one at a time.
 
     Args:
         problem: The problem.
         robot: Its robot.
         kernels: Where kernels are loaded from.
         world: Any world of the problem.
+        spec: Degree and numbers of control points; the problem's by default.
+        criterion: What is minimised beside the time, or None.
+        settings: How to iterate.
+        solver: "own", "ipopt" or "sqpmethod".
     """
 
-    def __init__(self, problem: Problem, robot: "Robot", *, kernels: KernelLibrary, world: "World") -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        robot: "Robot",
+        *,
+        kernels: KernelLibrary,
+        world: "World",
+        spec: TrajectorySpec | None = None,
+        criterion: Criterion | None = None,
+        settings: Settings = DEFAULT,
+        solver: str = "own",
+    ) -> None:
         self.problem, self.robot = problem, robot
-        self._values, self._jacobian = kernels.load(stage_values), kernels.load(stage_jacobian)
-        self._passes = default_passes(problem)
-        self._grids = [make_grid(problem, each.points) for each in self._passes]
-        self._bounds = [
-            BoundsTemplate(problem, world, grid.s, each.tightening)
-            for grid, each in zip(self._grids, self._passes, strict=True)
-        ]
-        self._fine = make_grid(problem, FINE)
-        self._fine_bounds = BoundsTemplate(problem, world, self._fine.s, Tightening(0.0, 0.0, 0.0, 0.0))
-        self._allowed = np.concatenate(
-            [
-                constraint.allowed(condition)
-                / residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
-                for constraint in problem.constraint
-                for condition in constraint.measured(world)
-            ]
-        )
+        self._minimise = minimise if solver == "own" else partial(minimise_with, solver=solver)
+        self.spec = problem.trajectory if spec is None else spec
+        residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
+        self.stage = Stage(self.spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals)
+        self.passes = default_passes(problem, settings)
+        self.check = FineCheck(problem, world, self.stage)
+        self._grids = {points: make_grid(self.spec, points) for points in {each.points for each in self._every}}
+        self._bounds = {
+            each: BoundsTemplate(problem, world, self._grids[each.points].s, each.tightening) for each in self._every
+        }
+
+    @property
+    def _every(self) -> tuple[Pass, ...]:
+        return tuple(vars(self.passes).values())
 
     @cached_property
     def _middle(self) -> Array:
         return (self.robot.position_lower + self.robot.position_upper) / 2
 
-    def refine(
-        self, boundary: Boundary, *, tops: Array, start_tip: Array, path: Array | None = None, rate: Array | None = None
-    ) -> Refined:
-        """Refine one plan, or make one from nothing.
+    def given(self, task: Task) -> Attempt | None:
+        """Return the plan of the task with exact boundary control points, or None where there is no usable one."""
+        if task.path is None or task.rate is None or not np.isfinite(task.path).all() or not np.all(task.rate > 0):
+            return None
+        if not np.isfinite(task.rate).all():
+            return None
+        x = self.check.transcription(task).pack(task.path, task.rate)
+        cost, excess = self.check.measure(task, x)
+        return Attempt(x, excess.worst, cost, Outcome.KEPT)
+
+    def attempts(self, task: Task, given: Attempt | None) -> Iterator[Attempt]:
+        """Yield plans, dearer ones later; whoever asks for the next one found something wrong with the last one.
 
         Args:
-            boundary: Boundary conditions of one motion.
-            tops: Heights of its obstacles [m], shape (obstacles,).
-            start_tip: Position of the tip at the start [m], shape (3,).
-            path: Path control points of the given plan [rad], shape (C, n), or None.
-            rate: Its rate control points [1/s], shape (R,), positive.
+            task: What to plan; its boundary conditions are numbers.
+            given: What ``given`` says of it.
         """
-        given = path is not None and rate is not None
-        fine = self._transcription(self._fine, boundary, tops)
-        limits = self._fine_bounds.of(start_tip)
+        straight = starts.straight(task.boundary, self.robot.velocity_limit, self.spec)
+        first = given.x if given is not None and given.excess < np.inf else _variables(straight)
+        best = self._attempt(task, self.passes.first, first, Outcome.SOLVED, warm=given is not None)
+        if best.excess > 1 and task.at_rest:
+            best = self._slowed(task, best)
+        yield best
+        polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
+        yield polished
+        best = polished if polished.is_better(best) else best
+        yield self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED, warm=True)
+        for start in self._other_starts(task):
+            other = self._attempt(task, self.passes.other, _variables(start), Outcome.RESTARTED)
+            yield self._slowed(task, other) if other.excess > 1 and task.at_rest else other
 
-        def excess(x: Array) -> float:
-            _, g = fine.value(x)
-            worst = (np.maximum(g - limits.upper, limits.lower - g) / self._allowed).max()
-            return float(worst) if np.isfinite(worst) else np.inf
+    def minimise(self, task: Task, which: Pass, x: Array, *, warm: bool = False) -> Result:
+        """Run one pass from x."""
+        settings = replace(which.settings, radius=min(which.settings.radius, WARM_RADIUS)) if warm else which.settings
+        motion = self.transcription(task, which)
+        return self._minimise(motion, self._bounds[which].of(task.start_xyz), x, settings)
 
-        if given:
-            assert path is not None
-            assert rate is not None
-            first = fine.pack(path, rate)
-        else:
-            first = np.concatenate([part.ravel() for part in self._straight(boundary)])
-        x, iterations = self._pass(0, boundary, tops, start_tip, first, warm=given)
-        best, outcome = (excess(x), x), Outcome.SOLVED
-        if best[0] > 1:
-            x, more = self._pass(1, boundary, tops, start_tip, best[1], warm=True)
-            iterations += more
-            best, outcome = min(best, (excess(x), x), key=lambda pair: pair[0]), Outcome.POLISHED
-        for other in self._other_starts(boundary) if best[0] > 1 else ():
-            x, more = self._pass(2, boundary, tops, start_tip, np.concatenate([p.ravel() for p in other]), warm=False)
-            iterations += more
-            best, outcome = min(best, (excess(x), x), key=lambda pair: pair[0]), Outcome.RESTARTED
-            if best[0] <= 1:
-                break
-        if best[0] > 1:
-            outcome = Outcome.UNSOLVED
-        if given and self._worse(fine, best, (excess(first), first)):
-            best, outcome = (excess(first), first), Outcome.KEPT
-        return Refined(*fine.unpack(best[1]), outcome, best[0], iterations)
+    def transcription(self, task: Task, which: Pass) -> Transcription:
+        """Return the motion on the grid of a pass."""
+        return Transcription(self.stage, self._grids[which.points], boundary=task.boundary, tops=task.tops)
 
-    def _worse(self, fine: Transcription, new: tuple[float, Array], old: tuple[float, Array]) -> bool:
-        """Whether the new plan breaks more than the old one, or breaks as little and costs more."""
-        if max(new[0], 1.0) != max(old[0], 1.0):
-            return max(new[0], 1.0) > max(old[0], 1.0)
-        return fine.value(new[1])[0] > fine.value(old[1])[0]
+    def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, *, warm: bool = False) -> Attempt:
+        result = self.minimise(task, which, x, warm=warm)
+        cost, excess = self.check.measure(task, result.x)
+        return Attempt(result.x, excess.worst, cost, outcome, result.iterations)
 
-    def _pass(
-        self, index: int, boundary: Boundary, tops: Array, start_tip: Array, x: Array, *, warm: bool
-    ) -> tuple[Array, int]:
-        each = self._passes[index]
-        settings = replace(each.settings, radius=min(each.settings.radius, 0.1)) if warm else each.settings
-        motion = self._transcription(self._grids[index], boundary, tops)
-        result = minimise(motion, self._bounds[index].of(start_tip), x, settings)
-        return result.x, result.iterations
+    def _slowed(self, task: Task, attempt: Attempt) -> Attempt:
+        x, cost, excess = self.check.slow_down(task, self.check.transcription(task), attempt.x)
+        slowed = Attempt(x, excess.worst, cost, Outcome.SLOWED, attempt.iterations)
+        return slowed if slowed.is_better(attempt) else attempt
 
-    def _transcription(self, grid: Grid, boundary: Boundary, tops: Array) -> Transcription:
-        return Transcription(
-            self.problem, grid, values=self._values, jacobian=self._jacobian, boundary=boundary, tops=tops
-        )
-
-    def _straight(self, boundary: Boundary) -> tuple[Array, Array]:
-        interior, rate = starts.straight(boundary, self.robot.velocity_limit, self.problem.trajectory)
-        return interior, np.log(rate)
-
-    def _other_starts(self, boundary: Boundary) -> "list[tuple[Array, Array]]":
-        spec, limit = self.problem.trajectory, self.robot.velocity_limit
-        found = [
+    def _other_starts(self, task: Task) -> list[tuple[Array, Array]]:
+        boundary, spec, limit = task.boundary, self.spec, self.robot.velocity_limit
+        return [
             starts.straight(boundary, limit, spec),
             starts.through(boundary, limit, spec, middle=self.robot.base),
             starts.smooth(boundary, limit, spec),
             starts.through(boundary, limit, spec, middle=self._middle),
         ]
-        return [(interior, np.log(rate)) for interior, rate in found]
+
+
+def _variables(start: tuple[Array, Array]) -> Array:
+    interior, rate = start
+    return np.concatenate([interior.ravel(), np.log(rate)])

@@ -15,6 +15,7 @@ from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 INFINITE = 1e30
+LEAP = 1.5  # the next step may be longer than the last one by this factor
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 
 
@@ -30,6 +31,7 @@ class Settings:
         cost_tolerance: Relative change of the objective below which a feasible iterate is optimal.
         violation_tolerance: Worst scaled violation of a feasible iterate.
         thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
+        qp_iterations: Largest number of working-set changes in one quadratic programme.
     """
 
     max_iterations: int = 40
@@ -37,8 +39,12 @@ class Settings:
     proximal: float = 0.1
     penalty: float = 2.0
     cost_tolerance: float = 2e-4
-    violation_tolerance: float = 3e-4
+    violation_tolerance: float = 6e-4
     thin: int = 6
+    qp_iterations: int = 3000
+
+
+DEFAULT = Settings()
 
 
 @dataclass(frozen=True)
@@ -48,14 +54,20 @@ class Bounds:
     Attributes:
         lower: Shape (K, m), -inf where there is none.
         upper: Shape (K, m).
+        sharp: Which residuals leap with the last rate control points, shape (K, m): accelerations at the ends.
     """
 
     lower: Array
     upper: Array
+    sharp: NDArray[np.bool_]
+
+    def excess(self, g: Array) -> Array:
+        """How far residuals g are outside, shape (K, m); negative inside."""
+        return np.maximum(g - self.upper, self.lower - g)
 
     def violation(self, g: Array) -> float:
         """Worst violation of residuals g, shape (K, m); inf where g is not finite."""
-        worst = float(np.maximum(g - self.upper, self.lower - g).max())
+        worst = float(self.excess(g).max())
         return max(worst, 0.0) if np.isfinite(worst) else np.inf
 
 
@@ -93,10 +105,13 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
     at = motion.evaluate(x)
     violation = bounds.violation(at.g)
     multipliers: Array | None = None
+    extra = np.zeros(at.g.shape, bool)
     converged = False
     iteration = 0
     for iteration in range(1, settings.max_iterations + 1):
-        chosen = _choose(at.g, bounds, settings.thin, 0.4 if length > 0.2 else 0.2 if length > 0.05 else 0.1)
+        near = 0.4 if length > 0.2 else 0.2 if length > 0.05 else 0.1
+        held = _choose(at.g, bounds, settings.thin, near, motion.leaps(at, LEAP * length)) | extra
+        chosen = _indices(held)
         step = _solve(motion, at, bounds, chosen, multipliers, settings, radius * scale, violation)
         if violation > settings.violation_tolerance and (step is None or step[1] > STUCK):
             step = _solve(motion, at, bounds, chosen, None, settings, radius * scale, violation, relax=True) or step
@@ -108,8 +123,7 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
         dx, beta, active = step
         cost, g = motion.value(at.x + dx)
         new_violation = bounds.violation(g)
-        full = np.concatenate([dx[motion.split :]])
-        model = at.gradient @ dx + 0.5 * full @ at.curvature @ full + 0.5 * settings.proximal * dx @ dx
+        model = at.gradient @ dx + 0.5 * dx @ at.curvature @ dx + 0.5 * settings.proximal * dx @ dx
         predicted = -model + settings.penalty * violation * (1 - beta)
         reduction = at.cost - cost + settings.penalty * (violation - new_violation)
         size = float(np.abs(dx / scale).max())
@@ -124,16 +138,29 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
                 return Result(at.x + dx, cost, new_violation, iteration, True)
             at = motion.evaluate(at.x + dx)
             violation = new_violation
+            extra[:] = False
         else:
-            radius = 0.35 * min(radius, size)
+            left_out = (bounds.excess(g) > settings.violation_tolerance) & ~held
+            extra |= left_out
+            if not left_out.any():
+                radius = 0.35 * min(radius, size)
         if radius < 1e-5:
             break
     return Result(at.x, at.cost, violation, iteration, converged)
 
 
-def _choose(g: Array, bounds: Bounds, thin: int, near: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pick the residuals that matter: close to a bound, and at a local maximum, active, or on the thinned grid."""
-    excess = np.maximum(g - bounds.upper, bounds.lower - g)
+def _indices(held: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    k, which = np.nonzero(held)
+    return k, which
+
+
+def _choose(g: Array, bounds: Bounds, thin: int, near: float, leaps: Array) -> NDArray[np.bool_]:
+    """Pick the residuals that matter, shape (K, m).
+
+    They are close to a bound, and at a local maximum, active, or on the thinned grid; or they are sharp and may leap
+    over it.
+    """
+    excess = bounds.excess(g)
     peak = np.zeros(excess.shape, bool)
     peak[1:-1] = (excess[1:-1] >= excess[:-2]) & (excess[1:-1] >= excess[2:])
     peak[0], peak[-1] = excess[0] >= excess[1], excess[-1] >= excess[-2]
@@ -142,8 +169,8 @@ def _choose(g: Array, bounds: Bounds, thin: int, near: float) -> tuple[NDArray[n
     wide[:-1] |= peak[1:]
     wide[::thin] = True
     wide |= excess > -0.003
-    k, which = np.nonzero(wide & (excess > -near))
-    return k, which
+    picked: NDArray[np.bool_] = (wide & (excess > -near)) | (bounds.sharp & (excess > -leaps))
+    return picked
 
 
 def _solve(  # noqa: PLR0917
@@ -175,9 +202,9 @@ def _solve(  # noqa: PLR0917
         rows[:, nx] = np.where(nearer, -violation, violation)
         high, low = np.where(nearer, upper - g, INFINITE), np.where(nearer, -INFINITE, lower - g)
     hessian = np.zeros((nx + 1, nx + 1))
+    hessian[:nx, :nx] = at.curvature
     diagonal = np.arange(nx)
-    hessian[diagonal, diagonal] = settings.proximal
-    hessian[motion.split : nx, motion.split : nx] += at.curvature
+    hessian[diagonal, diagonal] += settings.proximal
     hessian[nx, nx] = 1e-8
     linear = np.append(at.gradient, settings.penalty * violation + 1e-3)
     sense = np.zeros(nx + 1 + m, np.int32)
@@ -193,6 +220,7 @@ def _solve(  # noqa: PLR0917
         np.concatenate([-box, [0.0], np.maximum(low, -INFINITE)]),
         sense,
         primal_tol=1e-6,
+        iter_limit=settings.qp_iterations,
     )
     if flag < 1 or not np.isfinite(solution).all():
         return None

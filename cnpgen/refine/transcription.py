@@ -1,101 +1,26 @@
 """The optimisation problem of one motion: variables, residuals on a Chebyshev grid, and their derivatives.
 
 Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
-by
-construction: the boundary control points are functions of the first and last rate control points (paper, Appendix A).
+by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix A).
 Residuals are the problem's constraints, each divided by a natural size (a limit by itself, an equality by its
 tolerance), so that a violation of 1e-3 means the same everywhere.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.recipes import Problem
-from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.refine.criterion import Criterion
+from cnpgen.refine.grid import Bases, Grid
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.spline import basis, chebyshev, end_derivatives, gauss_rule
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.spline import end_derivatives
 
 Array = NDArray[np.float64]
-DISTANCE = 0.1  # m
+Indices = NDArray[np.intp]
 SMOOTH_RATE = 1e-4  # weight of the squared second differences of log r: fixes the gauge between p and r
-
-
-def stage_values(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(w, tops) -> g`` with ``w = (p, p', p'', r, r')``: all residuals at one phase."""
-    import casadi as ca
-
-    w_sx, tops_sx, g = _stage(robot, problem)
-    return ca.Function("stage_values", [w_sx, tops_sx], [ca.vertcat(*g)])
-
-
-def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(w, tops) -> (g, dg/dw)``, the Jacobian column by column."""
-    import casadi as ca
-
-    w_sx, tops_sx, g = _stage(robot, problem)
-    residuals = ca.vertcat(*g)
-    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
-    outputs = ca.cse([residuals, ca.vec(jacobian)])
-    return ca.Function("stage_jacobian", [w_sx, tops_sx], outputs)
-
-
-def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
-    n = robot.n
-    (w_sx, w), (tops_sx, tops) = symbols("w", 3 * n + 2), symbols("tops", len(problem.obstacle))
-    p, p1, p2, r, r1 = w[:n], w[n : 2 * n], w[2 * n : 3 * n], w[3 * n], w[3 * n + 1]
-    dq = [a * r for a in p1]
-    ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
-    size = problem.object.size if problem.object is not None else None
-    state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, size)
-    g = []
-    for constraint in problem.constraint:
-        for condition in constraint.symbolic(state):
-            scales = residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
-            g += [value / float(scale) for value, scale in zip(condition.g, scales, strict=True)]
-    return w_sx, tops_sx, g
-
-
-def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> Array:
-    """Natural size of residuals: the limit itself, twice the tolerance of an equality, 0.1 m of a distance."""
-    if kind == "limit":
-        return np.maximum(np.abs(lower), np.abs(upper))
-    return np.where(lower == upper, 2 * tolerance, DISTANCE)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Everything about the collocation grid that no motion changes.
-
-    Attributes:
-        s: Phases, shape (K,); s = 0 is left out, nothing can be changed there.
-        path: Basis of p, p', p'', shape (3, K, C).
-        rate: Basis of r, r', shape (2, K, R).
-        gauss: Basis of r at the nodes of the time integral, shape (Q, R).
-        weights: Quadrature weights of the time integral, shape (Q,).
-    """
-
-    s: Array
-    path: Array
-    rate: Array
-    gauss: Array
-    weights: Array
-
-
-def make_grid(problem: Problem, points: int) -> Grid:
-    """Build the Chebyshev grid of ``points`` phases."""
-    spec = problem.trajectory
-    s = chebyshev(points)[1:]
-    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(3)])
-    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)])
-    nodes, weights = gauss_rule(spec.rate_control_points, spec.degree, 5)
-    return Grid(s, path, rate, basis(nodes, spec.rate_control_points, spec.degree), weights)
 
 
 @dataclass(frozen=True)
@@ -104,9 +29,9 @@ class Evaluation:
 
     Attributes:
         x: The variables.
-        cost: Objective: duration [s] and the smoothing of r.
+        cost: Objective [s].
         gradient: Its gradient, shape (nx,).
-        curvature: Gauss-Newton Hessian in the logarithms of the rate, shape (R, R).
+        curvature: Positive semidefinite model of its Hessian, shape (nx, nx).
         g: Residuals, shape (K, m).
         jacobian: d(residuals)/d(w), shape (3 n + 2, m, K).
         rate: Rate control points, shape (R,).
@@ -121,28 +46,42 @@ class Evaluation:
     rate: Array
 
 
+@dataclass(frozen=True)
+class Stage:
+    """The kernels of a problem.
+
+    Attributes:
+        spec: Degree and numbers of control points.
+        values: Kernel of ``cnpgen.refine.stage.stage_values``.
+        jacobian: Kernel of ``cnpgen.refine.stage.stage_jacobian``.
+        criterion: What is minimised beside the time, or None.
+        residuals: Kernel of ``cnpgen.refine.criterion.criterion_residuals``, or None.
+    """
+
+    spec: TrajectorySpec
+    values: Kernel
+    jacobian: Kernel
+    criterion: Criterion | None = None
+    residuals: Kernel | None = None
+
+
 class Transcription:
     """One motion on one grid.
 
     Args:
-        problem: The problem.
+        stage: The kernels.
         grid: The grid.
-        values: Kernel of ``stage_values``.
-        jacobian: Kernel of ``stage_jacobian``.
         boundary: Boundary conditions of one motion.
         tops: Heights of its obstacles [m], shape (obstacles,).
     """
 
-    def __init__(
-        self, problem: Problem, grid: Grid, *, values: Kernel, jacobian: Kernel, boundary: Boundary, tops: Array
-    ) -> None:
-        spec = problem.trajectory
-        self.spec, self.grid, self.boundary = spec, grid, boundary
+    def __init__(self, stage: Stage, grid: Grid, *, boundary: Boundary, tops: Array) -> None:
+        spec = stage.spec
+        self.stage, self.spec, self.grid, self.boundary = stage, spec, grid, boundary
         self.n = boundary.start_q.shape[1]
         self.interior = spec.path_control_points - 3 - boundary.fixed_at_goal
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
-        self._values, self._jacobian = values, jacobian
         self._tops = np.repeat(tops[:, None], len(grid.s), axis=1)
         second = np.diff(np.eye(spec.rate_control_points), 2, axis=0)
         self._smooth = 2 * SMOOTH_RATE * second.T @ second
@@ -158,35 +97,34 @@ class Transcription:
         end = len(path) - self.boundary.fixed_at_goal
         return np.concatenate([path[3:end].ravel(), np.log(rate)])
 
-    def _stage(self, x: Array) -> tuple[Array, Array]:
-        path, rate = self.unpack(x)
-        w = np.empty((3 * self.n + 2, len(self.grid.s)))
-        w[: 3 * self.n] = (self.grid.path @ path).transpose(0, 2, 1).reshape(3 * self.n, -1)
-        w[3 * self.n :] = self.grid.rate @ rate
-        return w, rate
-
     def value(self, x: Array) -> tuple[float, Array]:
         """Evaluate objective and residuals (K, m) only."""
-        w, rate = self._stage(x)
-        (g,) = self._values(w, self._tops)
+        w, path, rate = self._at(x)
+        (g,) = self.stage.values(w, self._tops)
         log = x[self.split :]
-        inverse = 1.0 / (self.grid.gauss @ rate)
-        return float(inverse @ self.grid.weights + 0.5 * log @ self._smooth @ log), g.T
+        cost = self.grid.weights @ (1.0 / (self.grid.gauss @ rate)) + 0.5 * log @ self._smooth @ log
+        if self.stage.criterion is not None:
+            cost += self._criterion(path, rate)
+        return float(cost), g.T
 
     def evaluate(self, x: Array) -> Evaluation:
         """Evaluate objective and residuals with their derivatives."""
-        w, rate = self._stage(x)
-        g, jacobian = self._jacobian(w, self._tops)
+        w, path, rate = self._at(x)
+        g, jacobian = self.stage.jacobian(w, self._tops)
         log = x[self.split :]
         slope = self.grid.gauss * rate
         inverse = 1.0 / (self.grid.gauss @ rate)
         cost = float(inverse @ self.grid.weights + 0.5 * log @ self._smooth @ log)
         gradient = np.zeros(self.nx)
         gradient[self.split :] = -((self.grid.weights * inverse**2) @ slope) + self._smooth @ log
-        curvature = (slope * (2 * self.grid.weights * inverse**3)[:, None]).T @ slope + self._smooth
+        curvature = np.zeros((self.nx, self.nx))
+        bent = (slope * (2 * self.grid.weights * inverse**3)[:, None]).T @ slope
+        curvature[self.split :, self.split :] = bent + self._smooth
+        if self.stage.criterion is not None:
+            cost += self._add_criterion(path, rate, gradient, curvature)
         return Evaluation(x, cost, gradient, curvature, g.T, jacobian.reshape(w.shape[0], g.shape[0], -1), rate)
 
-    def rows(self, at: Evaluation, k: NDArray[np.intp], which: NDArray[np.intp]) -> Array:
+    def rows(self, at: Evaluation, k: Indices, which: Indices) -> Array:
         """Gradients of chosen residuals with respect to the variables.
 
         Args:
@@ -197,17 +135,61 @@ class Transcription:
         Returns:
             Shape (m, nx).
         """
+        return self._chain(at.jacobian[:, which, k].T, k, at.rate, self.grid.bases)
+
+    def leaps(self, at: Evaluation, step: float) -> Array:
+        """Bound how far r' alone can carry residuals when no log r changes by more than ``step``, shape (K, m)."""
+        change = np.abs(self.grid.bases.rate[1]) @ at.rate * step
+        reach: Array = np.abs(at.jacobian[3 * self.n + 1]).T * change[:, None]
+        return reach
+
+    def _at(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return w = (p, p', p'', r, r') on the grid, shape (3 n + 2, K), and the control points."""
+        path, rate = self.unpack(x)
+        return self.grid.bases.states(path, rate), path, rate
+
+    def _residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
+        """Return the criterion's residuals (m, Q) at its nodes, their Jacobian (4 n + 3, m, Q) and weights (Q,)."""
+        assert self.stage.criterion is not None
+        assert self.stage.residuals is not None
+        w = self.grid.criterion.states(path, rate)
+        e, jacobian = self.stage.residuals(w)
+        share = self.stage.criterion.weight * self.grid.criterion_weights / w[4 * self.n]
+        return e, jacobian.reshape(len(w), len(e), -1), share
+
+    def _criterion(self, path: Array, rate: Array) -> float:
+        """Return the criterion's cost."""
+        assert self.stage.criterion is not None
+        e, _, share = self._residuals(path, rate)
+        return float(share @ self.stage.criterion.rate(e)[0])
+
+    def _add_criterion(self, path: Array, rate: Array, gradient: Array, curvature: Array) -> float:
+        """Add the criterion's gradient and its Gauss-Newton Hessian; return its cost."""
+        assert self.stage.criterion is not None
+        bases = self.grid.criterion
+        e, jacobian, share = self._residuals(path, rate)
+        rho, slope = self.stage.criterion.rate(e)
+        m, points = e.shape
+        k, which = np.repeat(np.arange(points), m), np.tile(np.arange(m), points)
+        rows = self._chain(jacobian[:, which, k].T, k, rate, bases)
+        pull = (share * slope)[k]
+        gradient += (pull * e[which, k]) @ rows
+        gradient[self.split :] -= (share * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
+        curvature += (rows * pull[:, None]).T @ rows
+        return float(share @ rho)
+
+    def _chain(self, stage: Array, k: Indices, rate: Array, bases: Bases) -> Array:
+        """Turn derivatives in w at nodes k, shape (m, width of w), into derivatives in the variables, (m, nx)."""
         n, spec = self.n, self.spec
-        stage = at.jacobian[:, which, k].T  # (m, 3 n + 2)
         control = np.zeros((len(k), spec.path_control_points, n))
-        for order in range(3):
-            control += self.grid.path[order][k][:, :, None] * stage[:, None, order * n : (order + 1) * n]
+        for order, table in enumerate(bases.path):
+            control += table[k][:, :, None] * stage[:, None, order * n : (order + 1) * n]
         out = np.empty((len(k), self.nx))
-        end = spec.path_control_points - self.boundary.fixed_at_goal
+        end, first = spec.path_control_points - self.boundary.fixed_at_goal, len(bases.path) * n
         out[:, : self.split] = control[:, 3:end].reshape(len(k), -1)
-        speed = stage[:, 3 * n, None] * self.grid.rate[0][k] + stage[:, 3 * n + 1, None] * self.grid.rate[1][k]
-        out[:, self.split :] = speed * at.rate
-        for point, variable, derivative in self._boundary_slopes(at.rate):
+        speed = sum(stage[:, first + order, None] * table[k] for order, table in enumerate(bases.rate))
+        out[:, self.split :] = speed * rate
+        for point, variable, derivative in self._boundary_slopes(rate):
             out[:, self.split + variable] += control[:, point] @ derivative
         return out
 

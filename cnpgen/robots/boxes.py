@@ -10,6 +10,7 @@ from cnpgen.robots.symbolic import Vec
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
 ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one is needed
 TOUCHING = 1e-30  # m^2: the square root of less has no gradient
+FLAT = 1e-24  # m^2: keeps 1 / extent of a segment differentiable where it has none along an axis
 POINT = 1e-12  # m^2: keeps a distance of nothing, and a segment of no extent along an axis, differentiable
 
 
@@ -77,8 +78,9 @@ def _nearest(first: Vec, along: Vec, box: Bounds) -> Scalar:
     """Where on a segment its point nearest to a box is, in [0, 1]."""
     import casadi as ca
 
+    per_length = [extent / (extent * extent + FLAT) for extent in along]
     knots = [
-        ca.fmin(ca.fmax((face - first[axis]) / along[axis], 0), 1)
+        ca.fmin(ca.fmax((face - first[axis]) * per_length[axis], 0), 1)
         for axis in range(3)
         for face in box[axis]
         if face is not None

@@ -136,16 +136,18 @@ def _check_names(plan: DatasetPlan) -> None:
         raise UsageError(f"the fields must have different names, got {names}")
 
 
-def default_shard_size(rows: int) -> int:
+def default_shard_size(rows: int, block_rows: int = 4096) -> int:
     """Choose the rows per shard: about 16 shards, but between 8192 and 65536 rows, a power of two.
+
+    Where blocks are smaller than 4096 rows, since every row takes long, shards have 8 to 16 blocks: what is lost when a
+    worker is killed is less than a shard.
 
     Args:
         rows: Rows of the whole dataset.
-
-    Returns:
-        ``clip(2^round(log2(rows / 16)), 8192, 65536)``.
+        block_rows: Rows per block.
     """
-    return min(1 << max(round(math.log2(max(rows, 1) / 16)), 13), 65536)
+    low, high = (8192, 65536) if block_rows >= 4096 else (8 * block_rows, 16 * block_rows)
+    return int(min(max(1 << max(round(math.log2(max(rows, 1) / 16)), 0), low), high))
 
 
 def shards(plan: DatasetPlan) -> list[ShardTask]:
@@ -220,8 +222,17 @@ def save_plan(folder: Path, plan: DatasetPlan) -> None:
         return
     if folder.is_dir() and any(item.name != WORK for item in folder.iterdir()):
         raise DatasetError(f"{folder} is not empty and holds no dataset: choose another folder or empty it")
+    write_plan(folder, plan)
+
+
+def write_plan(folder: Path, plan: DatasetPlan) -> None:
+    """Write ``plan.json``, whatever was there.
+
+    Raises:
+        MachineError: The folder cannot be written.
+    """
     document = {"format": FORMAT, "format_version": FORMAT_VERSION, "fingerprint": plan.fingerprint}
-    save_document(path, document | to_json(plan), work=folder / WORK)
+    save_document(folder / PLAN, document | to_json(plan), work=folder / WORK)
 
 
 def load_plan(folder: Path) -> DatasetPlan:

@@ -1,0 +1,120 @@
+"""Stage: certified samples, each with a plan that Pinocchio and Coal call valid."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError
+from cnpgen.fields import Field
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stage import Batch, Run, Stage
+from cnpgen.recipes import DatasetRecipe, TrajectorySpec
+from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.threads import one_thread
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+
+if TYPE_CHECKING:
+    from cnpgen.refine.task import Refined
+    from cnpgen.verdict.verdict import Verdict
+
+Array = NDArray[np.float64]
+
+NO_PLAN = "no plan found"
+_ENDS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertifiedPlan(Stage):
+    """Solves every sample from nothing, with the problem's own objective, and keeps those with a valid plan."""
+
+    block_rows: ClassVar[int] = 64  # a sample takes some 30 ms: blocks of this stage must be small
+    needs = (*_ENDS, "start_xyz", "goal_xyz")
+
+    def describe(self) -> str:
+        """Say what is kept."""
+        return (
+            "plan every sample from nothing (sequential quadratic programming, several starts) and keep those whose"
+            " plan Pinocchio and Coal call valid on a time grid of 1 ms, with the plan"
+        )
+
+    def provides(self, context: Context) -> tuple[Field, ...]:
+        """The control points, flattened point by point, and the duration."""
+        spec, joints = context.problem.trajectory, context.robot.joint_names
+        points, rates = spec.path_control_points, spec.rate_control_points
+        path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
+        shape = f"({points}, {len(joints)})"
+        text = f"control points of the path p(s) of a valid plan, reshape to {shape}"
+        return (
+            Field("path_control_points", "rad", text, points * len(joints), path_names, role="target"),
+            Field(
+                "rate_control_points",
+                "1/s",
+                "control points of its rate r(s) = ds/dt",
+                rates,
+                tuple(f"R{point}" for point in range(rates)),
+                role="target",
+            ),
+            Field("duration", "s", "its motion time", role="target"),
+        )
+
+    def prepare(self, context: Context) -> Run:
+        """Load the refiner."""
+        if context.dtype != "float64":
+            raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
+        from cnpgen.refine.criterion import choose_criterion
+        from cnpgen.refine.polish import refine_task
+        from cnpgen.refine.refiner import Refiner
+        from cnpgen.refine.task import Task
+        from cnpgen.verdict.judge import judge
+        from cnpgen.verify.world import World
+
+        problem, robot = context.problem, context.robot
+        refiner = Refiner(
+            problem,
+            robot,
+            kernels=context.kernels,
+            world=World(problem, robot),
+            criterion=choose_criterion(problem),
+        )
+
+        def verdict(task: Task, path: Array, rate: Array) -> "Verdict":
+            motion, ends = Motion(path[None], rate[None], refiner.spec.degree), (task.start_xyz, task.goal_xyz)
+            return judge(problem, robot, motion, task.boundary, *(end[None] for end in ends))[0]
+
+        def run(batch: Batch, _random: np.random.Generator) -> None:
+            ends = (*_ENDS, "goal_ddq") if "goal_ddq" in batch.columns else _ENDS
+            boundary = Boundary(*(np.ascontiguousarray(batch[name].T) for name in ends))
+            starts, goals = (np.ascontiguousarray(batch[name].T) for name in ("start_xyz", "goal_xyz"))
+            tops = obstacle_tops(problem, starts, goals)
+            with one_thread():
+                found = [
+                    refine_task(refiner, verdict, Task(boundary[i : i + 1], tops[i], starts[i], goals[i]))
+                    for i in range(len(boundary))
+                ]
+            _write(batch, found, refiner.spec, robot.n)
+
+        return run
+
+
+def _write(batch: Batch, found: "list[Refined]", spec: TrajectorySpec, n: int) -> None:
+    """Write the plans' columns and reject the samples without a valid one."""
+    motion = Motion(
+        np.array([each.path for each in found]).reshape(len(found), spec.path_control_points, n),
+        np.array([each.rate for each in found]).reshape(len(found), spec.rate_control_points),
+        spec.degree,
+    )
+    batch["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(found), -1).T)
+    batch["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
+    batch["duration"] = motion.duration()[None]
+    batch.reject(np.array([each.valid for each in found], bool), NO_PLAN)
+
+
+def certified(recipe: DatasetRecipe) -> DatasetRecipe:
+    """Return the recipe of the certified dataset: one more stage, and a name that says so."""
+    if any(isinstance(stage, CertifiedPlan) for stage in recipe.pipeline.stage):
+        return recipe
+    pipeline = replace(recipe.pipeline, stage=(*recipe.pipeline.stage, CertifiedPlan()))
+    return replace(recipe, name=f"{recipe.name}-certified", pipeline=pipeline)

@@ -1,0 +1,36 @@
+"""``cnpgen refine``: polish the plans of a file."""
+
+import argparse
+from pathlib import Path
+
+from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
+
+_TEXT = (
+    """\
+The plans may come from any planner; docs/plan-format.md says how ten lines write a file of them. No plan comes back
+worse than it was given: violations count first, then the objective. Plans whose control points are no numbers are made
+from nothing.
+"""
+    + TEXT
+)
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "refine", run, title="polish the plans of a file", text=_TEXT)
+    parser.add_argument("file", metavar="FILE", type=Path, help="a file of plans, .h5")
+    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help="where to (default: FILE-refined.h5)")
+    parser.add_argument(
+        "--problem", metavar="NAME|FILE", help="the problem that they must be for; its tolerances count"
+    )
+    add_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.plans import load_plans
+
+    plans = load_plans(arguments.file, problem=arguments.problem)
+    out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
+    return refine_and_save(arguments, plans, out, title=f"refining {arguments.file}")

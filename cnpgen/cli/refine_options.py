@@ -1,0 +1,122 @@
+"""What ``refine`` and ``solve`` have in common: options, progress, what they print."""
+
+import argparse
+import json
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.progress import Meter
+from cnpgen.wording import counted
+
+if TYPE_CHECKING:
+    from cnpgen.plans import Plans
+    from cnpgen.refinement import Refinement
+
+LISTED = 10  # plans without success that are listed
+
+TEXT = """\
+Every plan is handled for itself: --workers and the order of the plans change nothing but the time. Pinocchio and Coal
+decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once: after Ctrl-C, kill -9
+or a full disk the same command goes on. The exit code is 0 if every plan is valid, and 1 if any is not; the file is
+written in either case. docs/refiner.md has the formulation.
+"""
+
+
+def add_options(parser: Parser) -> None:
+    """Add the options of both commands."""
+    option = parser.add_argument
+    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    option(
+        "--objective",
+        choices=("time", "effort", "jerk"),
+        default="time",
+        help="what is minimised: time and what the problem file adds to it (default), or effort or jerk beside time",
+    )
+    option("--weight", metavar="X", type=float, help="weight of what is minimised beside the time")
+    option("--solver", choices=("own", "ipopt", "sqpmethod"), default="own", help="ipopt and sqpmethod are CasADi's")
+    option("--max-iterations", metavar="I", type=values.natural, help="steps of the first pass (default: 40)")
+    option(
+        "--tolerance",
+        metavar="X",
+        type=float,
+        default=2e-4,
+        help="relative change of the objective at which a plan is finished (default: 2e-4)",
+    )
+    option("--step", metavar="S", type=values.seconds, default=1e-3, help="time between two looks (default: 1ms)")
+    option("--quiet", action="store_true", help="no progress and no summary")
+    add_json(parser)
+
+
+def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *, title: str) -> int:
+    """Refine plans, save them, say what came of them; return the exit code.
+
+    Args:
+        arguments: What ``add_options`` added.
+        plans: The plans.
+        out: Where they go.
+        title: What is going on.
+    """
+    from cnpgen.cli.notices import notices
+    from cnpgen.plans import save_plans
+    from cnpgen.refine.options import Options
+    from cnpgen.refinement import refine_plans
+
+    names = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")
+    options = Options(**{name: getattr(arguments, name) for name in names})
+    journal = out.with_name(out.name + ".part")
+    meter = Meter(quiet=arguments.quiet, noun="plan")
+    finished = [0, 0]
+
+    def progress(plans: int, valid: int) -> None:
+        finished[0], finished[1] = finished[0] + plans, finished[1] + valid
+        meter(plans)
+        meter.note(f"{finished[1] / finished[0]:.1%} valid")
+
+    try:
+        with notices(quiet=arguments.quiet):
+            found = refine_plans(
+                plans,
+                options=options,
+                workers=arguments.workers,
+                journal=journal,
+                begin=lambda total, there: meter.begin(title, total, there),
+                progress=progress,
+            )
+    except KeyboardInterrupt as interruption:
+        kept = f"{journal} keeps what is finished, run the same command again to go on"
+        raise type(interruption)(kept) from interruption
+    finally:
+        meter.close()
+    save_plans(out, found.plans)
+    journal.unlink(missing_ok=True)
+    _tell(arguments, found, out, meter.seconds)
+    return 0 if found.valid.all() else 1
+
+
+def _tell(arguments: argparse.Namespace, found: "Refinement", out: Path, seconds: float) -> None:
+    if not arguments.quiet:
+        print("\n".join(_summary(found, seconds)), file=sys.stderr)
+    print(json.dumps({"file": str(out), **found.summary()}, indent=2) if arguments.json else out)
+
+
+def _summary(found: "Refinement", seconds: float) -> list[str]:
+    """Say in a few lines what came of the plans."""
+    from cnpgen.refinement import outcome_text
+
+    facts = found.summary()
+    mean = facts["mean_duration_s"]
+    lines = [
+        f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {seconds:.1f} s"
+        + ("" if mean is None else f"; mean motion time {mean:.4f} s")
+    ]
+    lines += [f"  {count:,} {outcome_text(name)}" for name, count in facts["outcomes"].items()]
+    for failure in facts["not_valid"][:LISTED]:
+        text = f"plan {failure['plan']} (sample {failure['sample_id']}): {failure['reason']}; {failure['outcome']}"
+        lines += textwrap.wrap(text, 110, subsequent_indent="  ")
+    if len(facts["not_valid"]) > LISTED:
+        lines.append(f"... and {len(facts['not_valid']) - LISTED} more: 'cnpgen evaluate' lists them with --list")
+    return lines

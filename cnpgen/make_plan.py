@@ -1,0 +1,105 @@
+"""Planning datasets: everything that determines their bytes, resolved; nothing is made."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.kernels.library import choose_backend
+from cnpgen.library import load_dataset_recipe
+from cnpgen.make_shard import Job, versions
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.recipes import DatasetRecipe, recipe_digest, resolved, split_rows
+from cnpgen.store.plan import DatasetPlan, default_shard_size, load_plan
+
+MAX_ROWS = 10**12
+
+
+def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
+    """Return the folder of a dataset: what was asked for, else ``NAME-vMAJOR`` in the current folder.
+
+    Raises:
+        UsageError: It has no name.
+    """
+    if out is None:
+        return Path(f"{recipe.name}-v{recipe.version.split('.')[0]}")
+    if not str(out).strip():
+        raise UsageError(f"out must name a folder, got {str(out)!r}")
+    return Path(out)
+
+
+def plan_dataset(
+    recipe: str | Path | DatasetRecipe,
+    out: str | Path | None = None,
+    *,
+    n: int | None = None,
+    seed: int | None = None,
+    shard_size: int | None = None,
+    dtype: str = "float64",
+    backend: str | None = None,
+    resume: bool = False,
+) -> Job:
+    """Resolve what ``make_dataset`` would make, building its kernels but writing nothing of the dataset.
+
+    With ``resume``, backend and shard size that are not given are those with which the recipe was begun in the folder.
+
+    Raises:
+        RecipeError: The recipe has mistakes.
+        UsageError: An argument makes no sense.
+        MachineError: No working backend.
+    """
+    loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
+    total = sum(loaded.splits.values()) if n is None else n
+    if not 1 <= total <= MAX_ROWS:
+        raise UsageError(f"n must be between 1 and {MAX_ROWS}, got {total}")
+    folder = dataset_folder(loaded, out)
+    begun = _begun(folder, loaded) if resume else None
+    if begun is not None:
+        backend = begun.backend if backend is None else backend
+        shard_size = begun.shard_size if shard_size is None else shard_size
+    chosen, cache_folder = choose_backend(backend)
+    prepared = PreparedPipeline(loaded.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
+    plan = DatasetPlan(
+        name=loaded.name,
+        version=loaded.version,
+        title=loaded.title,
+        license=loaded.license,
+        recipe_sha256=recipe_digest(loaded),
+        recipe=resolved(loaded),
+        seed=loaded.seed if seed is None else seed,
+        splits=split_rows(loaded, total),
+        shard_size=default_shard_size(total, prepared.block_rows) if shard_size is None else shard_size,
+        block_rows=prepared.block_rows,
+        dtype=dtype,
+        backend=chosen,
+        fields=prepared.fields,
+        robot=_robot_record(prepared),
+        versions=versions(),
+    )
+    return Job(folder, plan, loaded.pipeline, chosen, cache_folder)
+
+
+def _begun(folder: Path, recipe: DatasetRecipe) -> DatasetPlan | None:
+    """Return the plan in a folder if it is one of the recipe; what else is there is not decided here."""
+    try:
+        found = load_plan(folder)
+    except DatasetError:
+        return None
+    return found if found.recipe_sha256 == recipe_digest(recipe) else None
+
+
+def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
+    robot = prepared.context.robot
+    limits = {
+        name: [float(x) for x in getattr(robot, name)]
+        for name in ("position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
+    }
+    urdf = robot.urdf.read_bytes()
+    return {
+        "name": robot.urdf.stem,
+        "urdf_sha256": hashlib.sha256(urdf).hexdigest(),
+        "urdf": urdf.decode(),
+        "tip": robot.tip,
+        "joint_names": list(robot.joint_names),
+        "limits": limits,
+    }

@@ -1,0 +1,106 @@
+"""What is minimised beside the time: centrifugal acceleration, effort or jerk, as residuals with derivatives."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.recipes import Problem
+from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.verdict.judge import JERK_RATE
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+Kind = Literal["centrifugal", "effort", "jerk"]
+
+OBJECTIVES = ("time", "effort", "jerk")
+ROUNDED = 0.5  # m/s^2: below, the centrifugal acceleration counts quadratically, so that its gradient is continuous
+SLOW = 1e-4  # m^2/s^2: keeps the direction of a tip at rest defined
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """A term ``weight * integral of rho(e(q, dq, ddq, jerk)) over time`` of the objective.
+
+    Attributes:
+        kind: "centrifugal": e is the tip's acceleration across its velocity [m/s^2] and rho its norm (paper, Appendix
+            B); "effort": torques as fractions of their limits and "jerk": jerks as fractions of 5/s x the acceleration
+            limits, rho the sum of squares.
+        weight: Its weight beside the time [s^2/m] or [1].
+    """
+
+    kind: Kind
+    weight: float
+
+    def rate(self, e: Array) -> tuple[Array, Array]:
+        """Evaluate rho and its curvature.
+
+        Args:
+            e: Residuals, shape (m, K).
+
+        Returns:
+            ``(rho, slope)``, shape (K,) each: ``slope * e`` is the gradient of rho in e, and ``slope`` times the
+            identity bounds its Hessian from above.
+        """
+        squares = np.sum(e * e, axis=0)
+        if self.kind != "centrifugal":
+            return squares, np.full(squares.shape, 2.0)
+        size = np.sqrt(squares + ROUNDED**2)
+        return size - ROUNDED, 1.0 / size
+
+
+def choose_criterion(problem: Problem, objective: str = "time", weight: float | None = None) -> Criterion | None:
+    """Return what is minimised beside the time.
+
+    Args:
+        problem: The problem.
+        objective: One of ``OBJECTIVES``; "time" is the problem's own objective: time and centrifugal acceleration.
+        weight: Weight of the term; by default the problem's for the centrifugal acceleration and 1 for the others.
+
+    Raises:
+        UsageError: There is no such objective, or the weight is not a positive number.
+    """
+    if objective not in OBJECTIVES:
+        raise UsageError(f"objective {objective!r} does not exist: expected one of {', '.join(OBJECTIVES)}")
+    if weight is not None and not 0 <= weight < np.inf:
+        raise UsageError(f"the weight of an objective must be a number that is not negative, got {weight}")
+    kind: Kind = "centrifugal" if objective == "time" else "effort" if objective == "effort" else "jerk"
+    default = problem.objective.centrifugal if kind == "centrifugal" else 1.0
+    chosen = default if weight is None else weight
+    return Criterion(kind, chosen) if chosen > 0 else None
+
+
+def criterion_residuals(robot: "Robot", kind: Kind) -> Any:
+    """Build ``w -> (e, de/dw)`` with ``w = (p, p', p'', p''', r, r', r'')``, the Jacobian column by column."""
+    import casadi as ca
+
+    n = robot.n
+    w_sx, w = symbols("w", 4 * n + 3)
+    p, p1, p2, p3 = (w[order * n : (order + 1) * n] for order in range(4))
+    r, r1, r2 = w[4 * n :]
+    dq = [a * r for a in p1]
+    ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
+    if kind == "jerk":
+        jerk = [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in zip(p1, p2, p3, strict=True)]
+        e = [x / float(JERK_RATE * limit) for x, limit in zip(jerk, robot.acceleration_limit, strict=True)]
+    else:
+        state = SymbolicState(robot, p, dq, ddq, [], (), None)
+        e = _across(state) if kind == "centrifugal" else _shares(state)
+    residuals = ca.vertcat(*e)
+    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
+    return ca.Function(f"criterion_{kind}", [w_sx], ca.cse([residuals, ca.vec(jacobian)]))
+
+
+def _across(state: SymbolicState) -> list[Any]:
+    """Acceleration of the tip across its velocity: of length kappa v^2."""
+    v, a = state.tip_velocity, state.tip_acceleration
+    along = sum(x * y for x, y in zip(v, a, strict=True)) / (sum(x * x for x in v) + SLOW)
+    return [y - along * x for x, y in zip(v, a, strict=True)]
+
+
+def _shares(state: SymbolicState) -> list[Any]:
+    return [tau / float(limit) for tau, limit in zip(state.torque, state.robot.torque_limit, strict=True)]

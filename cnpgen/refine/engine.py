@@ -1,0 +1,101 @@
+"""Refining some plans in one process: the refiner of their problem is built once and kept."""
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.problem import ProblemRecord, open_problem
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.refine.criterion import choose_criterion
+from cnpgen.refine.options import DEFAULT, Options
+from cnpgen.refine.polish import refine_task
+from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.sqp import Settings
+from cnpgen.refine.task import Refined, Task
+from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.trajectory.motion import Motion
+from cnpgen.verdict.judge import judge
+from cnpgen.verdict.verdict import Verdict
+
+if TYPE_CHECKING:
+    from cnpgen.recipes import Problem
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+def refine_part(plans: Plans, options: Options) -> list[Refined]:
+    """Refine plans, each for itself: neither the others nor their order change what comes of it.
+
+    Args:
+        plans: The plans; where control points are not finite or rates not positive, one is made from nothing.
+        options: How to.
+    """
+    refiner = prepare(plans, options)
+    problem, robot = open_problem(plans.problem)
+
+    def verdict(task: Task, path: Array, rate: Array) -> Verdict:
+        motion = Motion(path[None], rate[None], plans.degree)
+        ends = (task.start_xyz[None], task.goal_xyz[None])
+        return judge(problem, robot, motion, task.boundary, *ends, step=options.step)[0]
+
+    return [refine_task(refiner, verdict, task) for task in _tasks(plans, problem)]
+
+
+def prepare(plans: Plans, options: Options) -> Refiner:
+    """Return the refiner for plans; kernels that are not in the cache are compiled."""
+    spec = TrajectorySpec(
+        degree=plans.degree,
+        path_control_points=plans.path_control_points.shape[1],
+        rate_control_points=plans.rate_control_points.shape[1],
+    )
+    return _refiner(plans.problem, spec, options)
+
+
+def _tasks(plans: Plans, problem: "Problem") -> list[Task]:
+    starts, goals = plans.columns["start_xyz"], plans.columns["goal_xyz"]
+    tops = obstacle_tops(problem, starts, goals)
+    return [
+        Task(plans.boundary[i : i + 1], tops[i], starts[i], goals[i], path, rate)
+        for i, (path, rate) in enumerate(zip(plans.path_control_points, plans.rate_control_points, strict=True))
+    ]
+
+
+@lru_cache(maxsize=2)
+def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: Options) -> Refiner:
+    problem, robot = open_problem(record)
+    return load_refiner(problem, robot, spec=spec, options=options)
+
+
+def load_refiner(
+    problem: "Problem", robot: "Robot", *, spec: TrajectorySpec | None = None, options: Options = DEFAULT
+) -> Refiner:
+    """Build the refiner of a problem with the fastest kernels that this machine can run.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        spec: Degree and numbers of control points; the problem's by default.
+        options: How to refine.
+    """
+    from cnpgen.verify.world import World
+
+    backend, cache_folder = choose_backend(None)
+    kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})
+    settings = Settings(cost_tolerance=options.tolerance)
+    if options.max_iterations is not None:
+        settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+    return Refiner(
+        problem,
+        robot,
+        kernels=kernels,
+        world=World(problem, robot),
+        spec=spec,
+        criterion=choose_criterion(problem, options.objective, options.weight),
+        settings=settings,
+        solver=options.solver,
+    )

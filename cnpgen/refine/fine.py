@@ -1,0 +1,100 @@
+"""Residuals on a grid much finer than the optimiser's, and the uniform slow-down that some of them call for."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.recipes import Problem
+from cnpgen.refine.bounds import BoundsTemplate, Tightening
+from cnpgen.refine.grid import make_grid
+from cnpgen.refine.stage import residual_scale
+from cnpgen.refine.task import Task
+from cnpgen.refine.transcription import Stage, Transcription
+
+if TYPE_CHECKING:
+    from cnpgen.verify.world import World
+
+Array = NDArray[np.float64]
+POINTS = 600
+ATTEMPTS = 6
+LARGEST = 1.25  # a motion that must be slower than this is another motion: the optimiser finds a better one
+
+
+@dataclass(frozen=True)
+class Excess:
+    """By how much residuals exceed their bounds.
+
+    Attributes:
+        worst: The largest excess as a multiple of what is allowed; inf where something is not finite.
+        position: Whether a condition on q alone is exceeded by more than allowed.
+        slower: By which factor the motion must be slowed down for the worst velocity, acceleration and torque, if
+            those scaled with the rate and its square; at least 1.
+    """
+
+    worst: float
+    position: bool
+    slower: float
+
+
+class FineCheck:
+    """The fine check of motions of one problem.
+
+    Args:
+        problem: The problem.
+        world: Any world of it.
+        stage: The kernels.
+    """
+
+    def __init__(self, problem: Problem, world: "World", stage: Stage) -> None:
+        self._stage = stage
+        self._grid = make_grid(stage.spec, POINTS)
+        self._bounds = BoundsTemplate(problem, world, self._grid.s, Tightening(0.0, 0.0, 0.0, 0.0))
+        conditions = [(each, condition) for each in problem.constraint for condition in each.measured(world)]
+        self._allowed = np.concatenate(
+            [
+                each.allowed(condition)
+                / residual_scale(condition.lower, condition.upper, each.tolerance, condition.exactness)
+                for each, condition in conditions
+            ]
+        )
+        self._needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in conditions])
+
+    def transcription(self, task: Task) -> Transcription:
+        """Return the motion on the fine grid."""
+        return Transcription(self._stage, self._grid, boundary=task.boundary, tops=task.tops)
+
+    def measure(self, task: Task, x: Array) -> tuple[float, Excess]:
+        """Return the objective and the excess of a motion."""
+        cost, g = self.transcription(task).value(x)
+        bounds = self._bounds.of(task.start_xyz)
+        with np.errstate(invalid="ignore"):
+            beyond = np.maximum(g - bounds.upper, bounds.lower - g)
+        ratio = beyond / self._allowed
+        worst = float(ratio.max())
+        if not np.isfinite(worst):
+            return cost, Excess(np.inf, True, np.inf)
+        high = ratio > 1
+        size = np.abs(np.where(high, g, 0.0)).max(axis=0, initial=0.0)
+        speed, strength = (size[self._needs == needs].max(initial=1.0) for needs in (1, 2))
+        return cost, Excess(worst, bool(high[:, self._needs == 0].any()), max(speed, float(np.sqrt(strength))))
+
+    def slow_down(self, task: Task, motion: Transcription, x: Array) -> tuple[Array, float, Excess]:
+        """Slow a motion from rest to rest down uniformly until velocities, accelerations and torques are met.
+
+        Its path stays, its rate is divided by one factor. That cures no position and no torque against gravity.
+
+        Returns:
+            ``(variables, objective, excess)`` of the slowed motion, or of the last one tried.
+        """
+        total = 1.0
+        cost, excess = self.measure(task, x)
+        for _ in range(ATTEMPTS):
+            if excess.worst <= 1 or excess.position or total * excess.slower > LARGEST:
+                break
+            total *= excess.slower * (1 + 1e-9)
+            x = x.copy()
+            x[motion.split :] -= np.log(excess.slower * (1 + 1e-9))
+            cost, excess = self.measure(task, x)
+        return x, cost, excess

@@ -1,0 +1,86 @@
+"""Collocation grids: phases, spline bases there, and quadrature nodes; everything that no motion changes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
+
+Array = NDArray[np.float64]
+NODES = 4  # Gauss nodes per cell of the time integral: wrong by less than 1e-9 of it
+CRITERION_NODES = 40
+
+
+@dataclass(frozen=True)
+class Bases:
+    """Spline bases at some phases.
+
+    Attributes:
+        path: Basis of p and its derivatives, shape (orders, K, C).
+        rate: Basis of r and its derivatives, shape (orders - 1, K, R).
+    """
+
+    path: Array
+    rate: Array
+
+    def states(self, path: Array, rate: Array) -> Array:
+        """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K).
+
+        Args:
+            path: Path control points, shape (C, n).
+            rate: Rate control points, shape (R,).
+        """
+        orders, points, _ = self.path.shape
+        first = orders * path.shape[1]
+        w = np.empty((first + orders - 1, points))
+        w[:first] = (self.path @ path).transpose(0, 2, 1).reshape(first, points)
+        w[first:] = self.rate @ rate
+        return w
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid on (0, 1].
+
+    Attributes:
+        s: Phases, shape (K,); s = 0 is left out, nothing can be changed there.
+        bases: Bases there, three orders of p and two of r.
+        gauss: Basis of r at the nodes of the time integral, shape (Q, R).
+        weights: Quadrature weights of the time integral, shape (Q,).
+        criterion: Bases at the Gauss nodes of the criterion's integral, four orders of p and three of r: few nodes,
+            since it is smooth, and dense at both ends like the grid.
+        criterion_weights: Their quadrature weights.
+    """
+
+    s: Array
+    bases: Bases
+    gauss: Array
+    weights: Array
+    criterion: Bases
+    criterion_weights: Array
+
+
+def make_grid(spec: TrajectorySpec, points: int) -> Grid:
+    """Build the Chebyshev grid of ``points`` phases."""
+    s = chebyshev(points)[1:]
+    edges = graded_edges(spec.rate_control_points, spec.degree)
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    width = np.diff(edges)[:, None]
+    q = (edges[:-1, None] + width * (nodes + 1) / 2).ravel()
+    few, few_weights = np.polynomial.legendre.leggauss(CRITERION_NODES)
+    return Grid(
+        s,
+        bases=_bases(spec, s, 3),
+        gauss=basis(q, spec.rate_control_points, spec.degree),
+        weights=(width * weights / 2).ravel(),
+        criterion=_bases(spec, (few + 1) / 2, 4),
+        criterion_weights=few_weights / 2,
+    )
+
+
+def _bases(spec: TrajectorySpec, s: Array, orders: int) -> Bases:
+    path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
+    rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]
+    return Bases(np.stack(path), np.stack(rate))

@@ -1,0 +1,47 @@
+"""What users choose about refining."""
+
+from dataclasses import dataclass
+
+from cnpgen.errors import UsageError, nearest
+from cnpgen.refine.criterion import OBJECTIVES
+
+SOLVERS = ("own", "ipopt", "sqpmethod")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to refine.
+
+    Attributes:
+        objective: "time": the problem's own objective, time and centrifugal acceleration; "effort" or "jerk" beside the
+            time.
+        weight: Weight of what is minimised beside the time; by default the problem's, or 1 for effort and jerk.
+        solver: "own": sequential quadratic programming with DAQP; "ipopt" and "sqpmethod" are CasADi's.
+        max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down. By default the solver's.
+        tolerance: Relative change of the objective below which a feasible iterate is optimal.
+        step: The verdict looks at moments no further apart than this [s].
+
+    Raises:
+        UsageError: A value makes no sense.
+    """
+
+    objective: str = "time"
+    weight: float | None = None
+    solver: str = "own"
+    max_iterations: int | None = None
+    tolerance: float = 2e-4
+    step: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for what, value, known in (("objective", self.objective, OBJECTIVES), ("solver", self.solver, SOLVERS)):
+            if value not in known:
+                raise UsageError(
+                    f"{what} {value!r} does not exist: expected one of {', '.join(known)}{nearest(value, known)}"
+                )
+        if self.max_iterations is not None and self.max_iterations < 0:
+            raise UsageError(f"max_iterations must not be negative, got {self.max_iterations}")
+        if not 0 < self.tolerance < 1:
+            raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
+
+
+DEFAULT = Options()

@@ -1,0 +1,57 @@
+"""All residuals of a problem at one phase of a motion, as SX functions of the splines there."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.recipes import Problem
+from cnpgen.robots.symbolic import SymbolicState, symbols
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+DISTANCE = 0.1  # m
+
+
+def stage_values(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(w, tops) -> g`` with ``w = (p, p', p'', r, r')``: all residuals at one phase."""
+    import casadi as ca
+
+    w_sx, tops_sx, g = _stage(robot, problem)
+    return ca.Function("stage_values", [w_sx, tops_sx], [ca.vertcat(*g)])
+
+
+def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(w, tops) -> (g, dg/dw)``, the Jacobian column by column."""
+    import casadi as ca
+
+    w_sx, tops_sx, g = _stage(robot, problem)
+    residuals = ca.vertcat(*g)
+    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
+    outputs = ca.cse([residuals, ca.vec(jacobian)])
+    return ca.Function("stage_jacobian", [w_sx, tops_sx], outputs)
+
+
+def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
+    n = robot.n
+    (w_sx, w), (tops_sx, tops) = symbols("w", 3 * n + 2), symbols("tops", len(problem.obstacle))
+    p, p1, p2, r, r1 = w[:n], w[n : 2 * n], w[2 * n : 3 * n], w[3 * n], w[3 * n + 1]
+    dq = [a * r for a in p1]
+    ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
+    size = problem.object.size if problem.object is not None else None
+    state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, size)
+    g = []
+    for constraint in problem.constraint:
+        for condition in constraint.symbolic(state):
+            scales = residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
+            g += [value / float(scale) for value, scale in zip(condition.g, scales, strict=True)]
+    return w_sx, tops_sx, g
+
+
+def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> Array:
+    """Natural size of residuals: the limit itself, twice the tolerance of an equality, 0.1 m of a distance."""
+    if kind == "limit":
+        return np.maximum(np.abs(lower), np.abs(upper))
+    return np.where(lower == upper, 20 * tolerance, DISTANCE)

@@ -1,0 +1,182 @@
+"""Refining whole sets of plans: in as many processes as are wanted, with a journal that survives interruptions."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen import __version__
+from cnpgen.plans.plans import Plans, screen
+from cnpgen.plans.status import PlanStatus
+from cnpgen.refine.engine import prepare, refine_part
+from cnpgen.refine.journal import Journal, open_journal
+from cnpgen.refine.options import DEFAULT, Options
+from cnpgen.refine.task import Outcome, Refined
+from cnpgen.threads import one_thread
+from cnpgen.workers import share_out, worker_count
+
+FORMAT = "cnpgen-refinement"
+FORMAT_VERSION = 1
+ALONE = 60  # plans up to which a second process is not worth its start
+PART = 8  # plans that a process refines before it is given others
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """What came of N plans.
+
+    Attributes:
+        given: The plans as they were given.
+        plans: The refined plans, in the same order.
+        refined: How each of them ended.
+    """
+
+    given: Plans
+    plans: Plans
+    refined: tuple[Refined, ...]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether the independent verdict calls each plan valid, shape (N,)."""
+        return np.array([each.valid for each in self.refined], bool)
+
+    def summary(self) -> dict[str, Any]:
+        """Return for JSON what is said of all plans together."""
+        durations = self.plans.duration[self.valid]
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "plans": len(self.refined),
+            "valid": int(self.valid.sum()),
+            "outcomes": _counted(each.outcome.name.lower() for each in self.refined),
+            "reasons": _counted(each.reason for each in self.refined if not each.valid),
+            "mean_duration_s": float(durations.mean()) if len(durations) else None,
+            "median_iterations": float(np.median([each.iterations for each in self.refined])) if self.refined else None,
+            "not_valid": [
+                {"plan": index, "sample_id": int(sample), "reason": str(each.reason), "outcome": each.outcome.text}
+                for index, (sample, each) in enumerate(zip(self.plans.sample_id, self.refined, strict=True))
+                if not each.valid
+            ],
+        }
+
+
+def refine_plans(
+    plans: Plans,
+    *,
+    options: Options = DEFAULT,
+    workers: int | None = None,
+    journal: str | Path | None = None,
+    begin: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+) -> Refinement:
+    """Refine plans, or make them where their control points are nan.
+
+    Every plan is refined for itself: neither the others nor the number of processes change what comes of it. None
+    comes back worse than it was given: one that breaks less, by the independent verdict, or breaks nothing and costs
+    less, is taken.
+
+    Args:
+        plans: The plans.
+        options: How to refine.
+        workers: Processes; default one per available core, or one where a second would not pay.
+        journal: A file where finished plans are written down, and from which an interrupted run goes on.
+        begin: Called once with the number of plans and of those that the journal holds.
+        progress: Called with the numbers of plans finished and valid since the last call.
+
+    Raises:
+        UsageError: An option makes no sense, or there are fewer than one worker.
+        RecipeError: The problem needs a plug-in that is not installed.
+        MachineError: A worker died, or the journal cannot be written.
+    """
+    notes = None if journal is None else open_journal(Path(journal), _identity(plans, options))
+    done: dict[int, Refined] = {} if notes is None else dict(notes.finished)
+    if begin is not None:
+        begin(len(plans), len(done))
+    try:
+        for found in _run(plans, [i for i in range(len(plans)) if i not in done], options, workers, notes):
+            done |= found
+            if progress is not None:
+                progress(len(found), sum(each.valid for each in found.values()))
+    finally:
+        if notes is not None:
+            notes.close()
+    return _assembled(plans, [done[i] for i in range(len(plans))])
+
+
+def _run(
+    plans: Plans, waiting: list[int], options: Options, workers: int | None, journal: Journal | None
+) -> Iterator[dict[int, Refined]]:
+    if not waiting:
+        return
+    parts = [waiting[first : first + PART] for first in range(0, len(waiting), PART)]
+    count = worker_count(1 if workers is None and len(waiting) <= ALONE else workers, len(parts))
+    prepare(plans, options)  # kernels are compiled once, not by every worker
+    tasks = ((part, plans.select(np.array(part))) for part in parts)
+    advice = "" if journal is None else f": {journal.path} holds what is finished; run the same command again to go on"
+    with closing(share_out(partial(_refine, options=options), tasks, count, advice=advice)) as results:
+        for part, refined in results:
+            if journal is not None:
+                journal.append(part, refined)
+            yield dict(zip(part, refined, strict=True))
+
+
+def _refine(task: tuple[list[int], Plans], *, options: Options) -> tuple[list[int], list[Refined]]:
+    part, plans = task
+    with one_thread():
+        return part, refine_part(plans, options)
+
+
+def _assembled(given: Plans, refined: list[Refined]) -> Refinement:
+    """Put the refined plans together; beside them how they ended."""
+    if not refined:
+        return Refinement(given, given, ())
+    plans = replace(
+        given,
+        path_control_points=np.stack([each.path for each in refined]),
+        rate_control_points=np.stack([each.rate for each in refined]),
+        columns={**given.columns, **_columns(refined)},
+    )
+    valid = np.array([each.valid for each in refined])
+    unknown = np.where(screen(plans) == PlanStatus.UNKNOWN, PlanStatus.INVALID, screen(plans))
+    status = np.where(valid, PlanStatus.VALID, unknown).astype(np.uint8)
+    return Refinement(given, replace(plans, status=status), tuple(refined))
+
+
+def _columns(refined: list[Refined]) -> Mapping[str, Array]:
+    return {
+        "refine_outcome": np.array([each.outcome for each in refined], float),
+        "refine_iterations": np.array([each.iterations for each in refined], float),
+        "refine_objective": np.array([each.cost for each in refined], float),
+    }
+
+
+def _counted(words: Iterator[str]) -> dict[str, int]:
+    return {str(word): count for word, count in Counter(words).most_common()}
+
+
+def _identity(plans: Plans, options: Options) -> str:
+    """Say what distinguishes a run: version, options and every number of the plans."""
+    digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
+    boundary = [values for values in vars(plans.boundary).values() if values is not None]
+    ends = [plans.columns["start_xyz"], plans.columns["goal_xyz"]]
+    for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
+        digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
+    return json.dumps(
+        {"version": __version__, "options": asdict(options), "degree": plans.degree, "plans": digest.hexdigest()}
+    )
+
+
+def outcome_text(name: str) -> str:
+    """Return an outcome in words, from its lower-case name."""
+    return Outcome[name.upper()].text

@@ -1,0 +1,108 @@
+"""Problems to solve: rows of a dataset, or fresh draws of a recipe, as plans that are still to be made."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import choose_backend
+from cnpgen.library import load_dataset_recipe
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.problem import ProblemRecord, record_problem
+from cnpgen.recipes import DatasetRecipe
+from cnpgen.trajectory.boundary import Boundary
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Array = NDArray[np.float64]
+SPLIT = "test"  # of fresh draws: no row of a training or validation split is among them
+
+
+def problems_of_rows(problem: ProblemRecord, columns: "Mapping[str, Array]") -> Plans:
+    """Return rows of a dataset as plans whose control points are nan.
+
+    Args:
+        problem: Their problem.
+        columns: Field -> values, shape (N,) or (N, w), as shards hold them.
+    """
+    spec = problem.trajectory
+    rows, n = columns["start_q"].shape
+    names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")
+    boundary = Boundary(*(np.asarray(columns[name], float) for name in names if name in columns))
+    kept = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
+    return make_plans(
+        problem,
+        boundary,
+        path_control_points=np.full((rows, spec.path_control_points, n), np.nan),
+        rate_control_points=np.full((rows, spec.rate_control_points), np.nan),
+        columns={name: columns[name] for name in kept if name in columns},
+        sample_id=columns.get("sample_id"),
+    )
+
+
+def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n: int | None = None) -> Plans:
+    """Read rows of a dataset as plans that are still to be made.
+
+    Args:
+        folder: The dataset.
+        split: Which split.
+        start: The first row.
+        n: How many; by default all that follow.
+
+    Raises:
+        DatasetError: The folder holds no readable dataset.
+        UsageError: There is no such split, or it has no such rows.
+    """
+    from cnpgen.store.reader import open_dataset
+
+    dataset = open_dataset(Path(folder))
+    if split not in dataset.plan.splits:
+        raise UsageError(f"{folder} has no split {split!r}: expected one of {', '.join(dataset.plan.splits)}")
+    rows = dataset.plan.splits[split]
+    stop = rows if n is None else start + n
+    if not 0 <= start < stop <= rows:
+        raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {start} to {stop - 1}")
+    return problems_of_rows(_problem_of(dataset.plan), dataset.read(split, start=start, stop=stop))
+
+
+def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
+    """Draw fresh problems of a recipe's pipeline as plans that are still to be made.
+
+    Args:
+        recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a loaded recipe.
+        n: How many.
+        seed: Root seed; by default the recipe's. Equal seeds give equal problems.
+
+    Raises:
+        RecipeError: The recipe has mistakes.
+        UsageError: ``n`` is not positive.
+        MachineError: No backend works.
+    """
+    from cnpgen.pipelines.prepared import PreparedPipeline
+
+    if n < 1:
+        raise UsageError(f"n must be at least 1, got {n}")
+    loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
+    backend, cache_folder = choose_backend(None)
+    prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")
+    rows = prepared.block_rows
+    root = loaded.seed if seed is None else seed
+    parts = [
+        prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)).columns
+        for index in range(-(-n // rows))
+    ]
+    columns = {}
+    for field in prepared.fields:
+        values = np.concatenate([part[field.name] for part in parts], axis=1).T
+        columns[field.name] = np.ascontiguousarray(values if field.width else values[:, 0])
+    return problems_of_rows(record_problem(loaded.pipeline.problem), columns)
+
+
+def _problem_of(plan: Any) -> ProblemRecord:
+    """Return the problem that a dataset was made for."""
+    import json
+
+    return ProblemRecord(json.dumps(plan.recipe["pipeline"]["problem"], ensure_ascii=False), plan.robot["urdf"])
