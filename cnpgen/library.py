@@ -280,7 +280,7 @@ def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
     """Return the table unless it is clearly a recipe of another kind."""
     found = [kind for kind in _MARKS if _is(kind, table)]
     if found and not set(found) & set(kinds):
-        raise ValueError(f"is a {found[0]}, expected a {kinds[0]}")
+        raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}")
     return table
 
 

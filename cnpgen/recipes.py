@@ -127,8 +127,8 @@ class Problem:
     robot: RobotSpec = field("the robot")
     limits: LimitSpec = field("its planning limits")
     object: HeldObject | None = field("what it holds", default=None)
-    obstacle: tuple[Obstacle, ...] = field("the boxes of the world", default=())
-    constraint: tuple[Constraint, ...] = field("the constraint manifold", default=())
+    obstacle: tuple[Obstacle, ...] = field("the boxes of the world", default=(), form="[[obstacle]] tables")
+    constraint: tuple[Constraint, ...] = field("the constraint manifold", default=(), form="[[constraint]] tables")
     trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
     objective: Objective = field("what a good motion is", default=Objective())
     path: Path = Path()
@@ -159,7 +159,7 @@ class Pipeline:
     problem: Problem = field(
         "name of a shipped problem, or path of a problem file relative to this one", form="a name or a path"
     )
-    stage: tuple[Stage, ...] = field("the steps, in order")
+    stage: tuple[Stage, ...] = field("the steps, in order", form="[[stage]] tables")
     path: Path = Path()
     digest: str = ""
 

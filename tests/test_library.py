@@ -288,7 +288,7 @@ def test_a_byte_order_mark_is_ignored(files):
 
 
 def test_a_recipe_of_another_kind_is_a_mistake(files):
-    assert mistakes_of(load_dataset_recipe, files["problem"]) == ["is a problem, expected a dataset"]
+    assert mistakes_of(load_dataset_recipe, files["problem"]) == ["is a problem, expected a dataset or a pipeline"]
     assert mistakes_of(load_pipeline, files["dataset"]) == ["is a dataset, expected a pipeline"]
     assert mistakes_of(load_problem, files["pipeline"]) == ["is a pipeline, expected a problem"]
 
