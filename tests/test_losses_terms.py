@@ -13,6 +13,8 @@ from example_plans import PROBLEMS, ROBOTS
 from test_symbolic import HIGH, LOW, box_bounds, coal_segment_distance, segments
 
 from cnpgen.constraints.constraint import Condition
+from cnpgen.kernels.interpreted import InterpretedGridKernel
+from cnpgen.kernels.tape import Grid, tape_from_function
 from cnpgen.losses.published import published
 from cnpgen.losses.stage import HeldState
 from cnpgen.losses.terms import constraint_term
@@ -94,6 +96,23 @@ def test_the_gradient_with_the_nearest_point_held_is_that_of_finite_differences(
         values = np.array(signed["distance"].map(12)(shifted.T)).ravel()
         expected = (values[:6] - values[6:]) / 2e-6
         np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_segment_exactly_along_an_axis_in_the_middle_of_a_box_has_its_depth_and_a_gradient(signed, axis, dtype):
+    ends = np.repeat((LOW + HIGH)[None] / 2, 2, axis=0)
+    ends[:, axis] += [-0.05, 0.02]
+    grid = Grid(("point",), ("point",))
+    found = {}
+    for name in ("distance", "gradient"):
+        kernel = InterpretedGridKernel(tape_from_function(signed[name], grid=grid, dtype=dtype))
+        out = np.zeros((kernel.tape.outputs[0], 1, 1), dtype)
+        kernel(ends.reshape(6, 1, 1).astype(dtype), out=[out])
+        found[name] = out.ravel()
+    assert found["distance"] == pytest.approx([-depth_of(ends.mean(axis=0))], abs=1e-5)
+    assert np.isfinite(found["gradient"]).all()
+    assert np.abs(found["gradient"]).max() > 0.1
 
 
 # --- published forms --------------------------------------------------------------------------------------------------

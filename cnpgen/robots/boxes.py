@@ -10,8 +10,8 @@ from cnpgen.robots.symbolic import Vec
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
 ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one is needed
 TOUCHING = 1e-30  # m^2: the square root of less has no gradient
-FLAT = 1e-24  # m^2: keeps 1 / extent of a segment differentiable where it has none along an axis
-POINT = 1e-12  # m^2: keeps a distance of nothing, and a segment of no extent along an axis, differentiable
+FLAT = 1e-12  # m: what a segment's extent along an axis is taken for where it has none, so that there is 1 / extent
+POINT = 1e-12  # m^2: keeps a signed distance of nothing differentiable
 
 
 def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
@@ -67,9 +67,8 @@ def _middle(first: Vec, along: Vec, box: Bounds) -> Scalar:
 
     enter, leave = ca.SX(0), ca.SX(1)
     for axis, (low, high) in enumerate(box):
-        per_length = along[axis] / (along[axis] * along[axis] + POINT)
         bounds = [high - ENDLESS if low is None else low, low + ENDLESS if high is None else high]
-        faces = [(face - first[axis]) * per_length for face in bounds]
+        faces = [(face - first[axis]) * _inverse(along[axis]) for face in bounds]
         enter, leave = ca.fmax(enter, ca.fmin(*faces)), ca.fmin(leave, ca.fmax(*faces))
     return ca.fmax(ca.fmin(0.5 * (enter + leave), 1), 0)
 
@@ -78,9 +77,8 @@ def _nearest(first: Vec, along: Vec, box: Bounds) -> Scalar:
     """Where on a segment its point nearest to a box is, in [0, 1]."""
     import casadi as ca
 
-    per_length = [extent / (extent * extent + FLAT) for extent in along]
     knots = [
-        ca.fmin(ca.fmax((face - first[axis]) * per_length[axis], 0), 1)
+        ca.fmin(ca.fmax((face - first[axis]) * _inverse(along[axis]), 0), 1)
         for axis in range(3)
         for face in box[axis]
         if face is not None
@@ -93,6 +91,10 @@ def _nearest(first: Vec, along: Vec, box: Bounds) -> Scalar:
     slope_low, slope_high = _slope(first, along, box, low), _slope(first, along, box, high)
     fraction = ca.fmax(ca.fmin(-slope_low / ca.fmax(slope_high - slope_low, 1e-30), 1), 0)  # a number of float32, too
     return low + fraction * (high - low)
+
+
+def _inverse(extent: Scalar) -> Scalar:
+    return 1 / (extent + FLAT * (extent == 0))
 
 
 def _outside(x: Scalar, bounds: tuple[Any, Any]) -> Scalar:
