@@ -21,10 +21,12 @@ from cnpgen.recipes import DatasetRecipe, recipe_digest
 from cnpgen.robots.robot import load_robot
 from cnpgen.shard_checks import check_numbers
 from cnpgen.store.check import DELETE, Finding, check_dataset
+from cnpgen.store.layout import PLAN
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.reader import StoredDataset
 from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard
+from cnpgen.store.workspace import is_dataset
 from cnpgen.verify.report import RowReport, merge
 from cnpgen.verify.rows import verify_rows
 from cnpgen.wording import counted
@@ -115,7 +117,8 @@ def validate_dataset(
         progress: Called with the rows of every shard that was recomputed.
 
     Raises:
-        UsageError: There is no dataset, or an argument makes no sense.
+        UsageError: There is no folder, or an argument makes no sense.
+        DatasetError: It holds no dataset.
         RecipeError: The recipe in the plan does not fit this version of cnpgen.
         PluginError: It needs packages that are not installed, for what was asked for.
         MachineError: The disk fails, or the backend that made the dataset does not work here and blocks are to be
@@ -123,7 +126,10 @@ def validate_dataset(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise UsageError(f"{folder} is not a folder")
+        what = "a file" if folder.exists() else "not there"
+        raise UsageError(f"{folder} is {what}, expected the folder of a dataset")
+    if not is_dataset(folder):
+        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
     if regenerate < 0:
         raise UsageError(f"regenerate must not be negative, got {regenerate}")
     findings = list(check_dataset(folder))

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.errors import MachineError
+from cnpgen.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from cnpgen.doctor import MachineReport
 
 
@@ -64,13 +63,9 @@ def machine_text(report: "MachineReport") -> str:
 
 def _verdict(report: "MachineReport") -> str:
     if not report.ok:
-        return f"cnpgen does not work here: {_counted(report.problems, 'problem')}, below"
+        return f"cnpgen does not work here: {counted(len(report.problems), 'problem')}, below"
     text = "everything that cnpgen needs works"
-    return f"{text}; {_counted(report.notes, 'warning')}, below" if report.notes else text
-
-
-def _counted(things: "Sequence[str]", noun: str) -> str:
-    return f"{len(things)} {noun}" if len(things) == 1 else f"{len(things)} {noun}s"
+    return f"{text}; {counted(len(report.notes), 'warning')}, below" if report.notes else text
 
 
 def _folded(text: str) -> str:

@@ -118,7 +118,10 @@ def _run(words: list[str]) -> int:
     if chosen is parser:
         parser.print_help(sys.stderr)
         return 2
-    code: int = arguments.run(arguments)
+    from cnpgen.cli.notices import notices
+
+    with notices(quiet=getattr(arguments, "quiet", False)):
+        code: int = arguments.run(arguments)
     return code
 
 

@@ -43,11 +43,9 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.cli.notices import notices
     from cnpgen.store.documents import plain, render
 
-    with notices():
-        report = _validate(arguments)
+    report = _validate(arguments)
     if arguments.json:
         print(render(plain(report.to_dict())))
     else:

@@ -124,7 +124,8 @@ def _check_sizes(plan: DatasetPlan) -> None:
     if plan.dtype not in {"float64", "float32"}:
         raise UsageError(f"dtype must be 'float64' or 'float32', got {plan.dtype!r}")
     if any(rows < 0 for rows in plan.splits.values()) or not any(plan.splits.values()):
-        raise UsageError(f"the splits must have rows, got {dict(plan.splits)}")
+        found = ", ".join(f"{name} {rows}" for name, rows in plan.splits.items())
+        raise UsageError(f"the splits must have rows, got {found or 'none'}")
 
 
 def _check_names(plan: DatasetPlan) -> None:
