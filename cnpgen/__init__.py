@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cnpgen.inspection import inspect_dataset
     from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, load_problem
     from cnpgen.loader.load import load_dataset
+    from cnpgen.losses.plan_loss import PlanLoss
     from cnpgen.make import make_dataset
     from cnpgen.plans.load import load_plans
     from cnpgen.plans.plans import Plans, make_plans
@@ -30,6 +31,7 @@ _HOME = {
     "DatasetError": "errors",
     "Evaluation": "evaluation",
     "MachineError": "errors",
+    "PlanLoss": "losses.plan_loss",
     "Plans": "plans.plans",
     "RecipeError": "errors",
     "UsageError": "errors",
@@ -56,6 +58,7 @@ __all__ = [
     "DatasetError",
     "Evaluation",
     "MachineError",
+    "PlanLoss",
     "Plans",
     "RecipeError",
     "UsageError",
