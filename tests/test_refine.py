@@ -142,7 +142,7 @@ def test_objectives_are_chosen_by_name_and_nonsense_is_refused() -> None:
     with pytest.raises(UsageError, match=r"objective 'tiem' .*did you mean 'time'"):
         Options(objective="tiem")
     with pytest.raises(UsageError, match="weight of an objective"):
-        choose_criterion(problem, "effort", -1.0)
+        Options(objective="effort", weight=-1.0)
     with pytest.raises(UsageError, match="tolerance must be between 0 and 1, got 0"):
         Options(tolerance=0)
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
 from cnpgen.recipes import Problem
 from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.verdict.judge import JERK_RATE
@@ -60,14 +59,7 @@ def choose_criterion(problem: Problem, objective: str = "time", weight: float | 
         problem: The problem.
         objective: One of ``OBJECTIVES``; "time" is the problem's own objective: time and centrifugal acceleration.
         weight: Weight of the term; by default the problem's for the centrifugal acceleration and 1 for the others.
-
-    Raises:
-        UsageError: There is no such objective, or the weight is not a positive number.
     """
-    if objective not in OBJECTIVES:
-        raise UsageError(f"objective {objective!r} does not exist: expected one of {', '.join(OBJECTIVES)}")
-    if weight is not None and not 0 <= weight < np.inf:
-        raise UsageError(f"the weight of an objective must be a number that is not negative, got {weight}")
     kind: Kind = "centrifugal" if objective == "time" else "effort" if objective == "effort" else "jerk"
     default = problem.objective.centrifugal if kind == "centrifugal" else 1.0
     chosen = default if weight is None else weight

@@ -38,6 +38,8 @@ class Options:
                 raise UsageError(
                     f"{what} {value!r} does not exist: expected one of {', '.join(known)}{nearest(value, known)}"
                 )
+        if self.weight is not None and not 0 <= self.weight < float("inf"):
+            raise UsageError(f"the weight of an objective must be a number that is not negative, got {self.weight}")
         if self.max_iterations is not None and self.max_iterations < 0:
             raise UsageError(f"max_iterations must not be negative, got {self.max_iterations}")
         if not 0 < self.tolerance < 1:

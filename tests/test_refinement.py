@@ -1,0 +1,193 @@
+"""Refining sets of plans: every plan for itself, in any number of processes, resumable; problems to solve; commands."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.cli.main import main
+from cnpgen.errors import UsageError
+from cnpgen.evaluation import evaluate_plans
+from cnpgen.make import make_dataset
+from cnpgen.plans import PlanStatus, load_plans, save_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.refine.options import Options
+from cnpgen.refinement import PART, refine_plans
+from cnpgen.solving import draw_problems, load_problems
+
+N = 2 * PART + 1
+
+
+@pytest.fixture(scope="module")
+def problems() -> Plans:
+    return draw_problems("airhockey-replan", N, seed=5)
+
+
+@pytest.fixture(scope="module")
+def solved(problems: Plans) -> Plans:
+    return refine_plans(problems, workers=1).plans
+
+
+def same(one: Plans, other: Plans) -> bool:
+    return np.array_equal(one.path_control_points, other.path_control_points) and np.array_equal(
+        one.rate_control_points, other.rate_control_points
+    )
+
+
+def test_what_is_solved_is_valid_by_evaluate_and_says_so(solved: Plans) -> None:
+    assert (solved.status == PlanStatus.VALID).all()
+    assert evaluate_plans(solved).valid.all()
+
+
+def test_neither_workers_nor_the_order_of_the_plans_change_anything(problems: Plans, solved: Plans) -> None:
+    shuffled = np.random.default_rng(0).permutation(N)
+    again = refine_plans(problems.select(shuffled), workers=2).plans
+    assert same(again.select(np.argsort(shuffled)), solved)
+
+
+def test_plans_that_are_refined_again_are_no_worse(solved: Plans) -> None:
+    again = refine_plans(solved, workers=1)
+    assert again.valid.all()
+    assert (again.plans.columns["refine_objective"] <= solved.columns["refine_objective"] + 1e-12).all()
+
+
+def test_garbage_among_plans_leaves_the_others_alone(problems: Plans, solved: Plans) -> None:
+    path, rate = problems.path_control_points.copy(), problems.rate_control_points.copy()
+    path[1], rate[1] = 40.0, 1.0
+    rate[2] = -1.0
+    boundary = replace(problems.boundary, goal_q=problems.boundary.goal_q.copy())
+    boundary.goal_q[3] = np.nan
+    found = refine_plans(replace(problems, path_control_points=path, rate_control_points=rate, boundary=boundary))
+    assert found.plans.status[3] == PlanStatus.NOT_FINITE
+    assert np.delete(found.valid, 3).all()
+    others = np.delete(np.arange(N), [1, 2, 3])
+    assert same(found.plans.select(others), solved.select(others))
+
+
+def test_an_interrupted_run_goes_on_where_it_was(problems: Plans, solved: Plans, tmp_path: Path) -> None:
+    def stop(_plans: int, _valid: int) -> None:
+        raise KeyboardInterrupt
+
+    journal, begun = tmp_path / "journal", []
+    with pytest.raises(KeyboardInterrupt):
+        refine_plans(problems, workers=1, journal=journal, progress=stop)
+    found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
+    assert begun == [(N, PART)]
+    assert same(found.plans, solved)
+    refine_plans(
+        problems, workers=1, journal=journal, options=Options(tolerance=1e-3), begin=lambda *n: begun.append(n)
+    )
+    assert begun[-1] == (N, 0), "other options are another run"
+
+
+def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
+    found = refine_plans(solved, options=Options(max_iterations=0))
+    assert found.valid.all()
+    assert {each.iterations for each in found.refined} == {0}
+
+
+@pytest.mark.parametrize("objective", ["effort", "jerk"])
+def test_another_objective_gets_what_it_asks_for(problems: Plans, solved: Plans, objective: str) -> None:
+    few = np.arange(4)
+    found = refine_plans(problems.select(few), options=Options(objective=objective, weight=1.0)).plans
+    before, after = (evaluate_plans(plans).verdicts for plans in (solved.select(few), found))
+    assert all(verdict.valid for verdict in after)
+    assert np.mean([getattr(v.metrics, objective) for v in after]) < np.mean(
+        [getattr(v.metrics, objective) for v in before]
+    )
+
+
+def test_drawn_problems_are_those_of_the_seed_and_of_no_other_split(tmp_path: Path) -> None:
+    some, more = draw_problems("airhockey-hit", 5, seed=3), draw_problems("airhockey-hit", 9, seed=3)
+    np.testing.assert_array_equal(more.boundary.start_q[:5], some.boundary.start_q)
+    made = make_dataset("airhockey-hit", tmp_path / "hits", n=40, seed=3, workers=1)
+    train = load_problems(made.folder, split="train")
+    assert not np.isin(some.boundary.start_q[:, 0], train.boundary.start_q[:, 0]).any()
+    rows = load_problems(made.folder, split="validation", start=1, n=2)
+    assert rows.sample_id.tolist() == [1, 2]
+    with pytest.raises(UsageError, match="no split 'trian'"):
+        load_problems(made.folder, split="trian")
+    with pytest.raises(UsageError, match=r"rows 0 to \d+, got 0 to 999"):
+        load_problems(made.folder, split="validation", n=1000)
+    with pytest.raises(UsageError, match="n must be at least 1, got 0"):
+        draw_problems("airhockey-hit", 0)
+
+
+def test_solve_and_refine_write_files_that_evaluate_calls_valid(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "plans.h5"
+    assert main(["solve", "airhockey-hit", "--n", "3", "--out", str(out), "--workers", "1"]) == 0
+    assert capsys.readouterr().out.strip() == str(out)
+    assert main(["refine", str(out), "--json", "--quiet"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["plans"], said["valid"], said["not_valid"]) == (3, 3, [])
+    assert main(["evaluate", said["file"]]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plans-refined.h5", "plans.h5"]
+
+
+def test_plans_without_success_are_named_and_the_exit_code_is_1(
+    problems: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    boundary = replace(problems.boundary, goal_dq=problems.boundary.goal_dq.copy())
+    boundary.goal_dq[1] = 9.0
+    save_plans(tmp_path / "hard.h5", replace(problems, boundary=boundary).select(slice(0, 2)))
+    assert main(["refine", str(tmp_path / "hard.h5"), "-o", str(tmp_path / "out.h5")]) == 1
+    text = capsys.readouterr().err
+    assert "1 of 2 plans valid" in text
+    assert "plan 1 (sample 1): boundary" in text or "plan 1 (sample 1): joint velocity limit" in text
+    assert load_plans(tmp_path / "out.h5").status.tolist() == [PlanStatus.VALID, PlanStatus.INVALID]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["solve", "airhockey-hit"], "--n says how many"),
+        (["solve", "airhockey-hit", "--n", "2", "--split", "train"], "--split and --first are for the folder"),
+        (["solve", "airhokey-hit", "--n", "2"], "did you mean 'airhockey-hit'"),
+        (["refine", "nowhere.h5"], "nowhere.h5"),
+        (["solve", "airhockey-hit", "--n", "2", "--tolerance", "2"], "tolerance must be between 0 and 1"),
+        (["solve", "airhockey-hit", "--n", "2", "--weight", "-1"], "weight of an objective"),
+    ],
+)
+def test_bad_arguments_are_one_line_and_leave_nothing_behind(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) in {1, 2}
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cnpgen: error")]
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_killed_solve_loses_nothing_that_was_finished(number: int, tmp_path: Path) -> None:
+    out = tmp_path / "plans.h5"
+    words = [sys.executable, "-m", "cnpgen", "solve", "airhockey-hit", "--n", "40", "-o", str(out), "--workers", "2"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"TERM": "dumb"})
+    journal, deadline = out.with_name("plans.h5.part"), time.monotonic() + 120
+    while not (journal.exists() and journal.stat().st_size > 20_000) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    assert not out.exists()
+    kept = journal.stat().st_size
+    assert kept > 20_000
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "there already" in done.stderr
+    assert same(load_plans(out), refine_plans(draw_problems("airhockey-hit", 40), workers=1).plans)
+    assert not journal.exists()
