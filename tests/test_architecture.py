@@ -24,7 +24,8 @@ LAYERS = (
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
     ("interop", "certification"),
-    ("make_shard", "make", "validation", "consistency", "shard_checks", "inspection", "describe", "plots", "doctor"),
+    ("make_shard", "make_plan", "make"),
+    ("validation", "consistency", "shard_checks", "deep_check", "regeneration", "inspection", "describe", "plots", "doctor"),
     ("evaluation", "refinement", "solving"),
     ("cli", "__main__", "__init__"),
 )

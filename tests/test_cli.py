@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from cnpgen.cli.main import main
 from cnpgen.cli.plan_text import size_text
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
-from cnpgen.make import MAX_ROWS
+from cnpgen.make_plan import MAX_ROWS
 from cnpgen.outcome import Outcome
 from cnpgen.store.check import Finding
 from cnpgen.validation import ValidationReport
@@ -206,8 +207,8 @@ def test_stdout_is_the_folder_and_stderr_a_start_and_a_summary(run, tmp_path):
     start, *summary = err.splitlines()
     assert start == f"making {tmp_path / 'hits'}: 200 rows"
     text = " ".join(summary)
-    assert text.startswith("made 200 rows (train 182, validation 18) in ")
-    assert "rows/s" in text
+    times = r"[\d.]+ s: [\d.]+ s to get ready, then [\d,]+ rows/s"
+    assert re.match(rf"made 200 rows \(train 182, validation 18\) in {times} accepted ", text)
     assert "accepted " in text
     assert "rejected: " in text
     assert len(summary) <= 3
@@ -216,7 +217,7 @@ def test_stdout_is_the_folder_and_stderr_a_start_and_a_summary(run, tmp_path):
 def test_a_finished_dataset_is_already_complete(run, hits):
     code, out, err = run(*MAKE, hits)
     assert (code, out) == (0, f"{hits}\n")
-    assert "200 are there already" in err
+    assert err.splitlines()[:2] == [f"checking {hits}: 200 rows", f"making {hits}: 200 rows, 200 there already"]
     assert "already complete: 200 rows (train 182, validation 18)" in err
 
 
@@ -238,12 +239,37 @@ def test_another_dataset_is_refused_until_it_is_forced(run, hits, tmp_path):
 def test_parts_make_a_whole(run, tmp_path):
     folder = tmp_path / "parts"
     first = run(*MAKE, folder, "--part", "0/2")
-    assert "made 182 of 200 rows" in first[2]
-    assert "other parts are still to be made" in " ".join(first[2].split())
-    assert "already made, this part of" in run(*MAKE, folder, "--part", "0/2")[2]
+    assert f"making {folder}: 182 rows\n" in first[2]
+    assert "made 182 rows (train 182), part 0/2 of 200 rows, in " in first[2]
+    assert "; other parts are still to be made" in " ".join(first[2].split())
+    again = run(*MAKE, folder, "--part", "0/2")[2]
+    assert "already made: 182 rows (train 182), part 0/2 of 200 rows; other parts are still to be made" in again
     assert not (folder / "manifest.json").exists()
-    assert "made the last 18 of 200 rows" in run(*MAKE, folder, "--part", "1/2")[2]
+    last = " ".join(run(*MAKE, folder, "--part", "1/2")[2].split())
+    assert "made 18 rows (validation 18), part 1/2 of 200 rows, in " in last
+    assert "rows/s; all parts are made accepted" in last
     assert (folder / "manifest.json").exists()
+
+
+def test_a_part_that_was_interrupted_says_what_was_missing_of_it(run, tmp_path):
+    folder = tmp_path / "parts"
+    words = [*MAKE, folder, "--shard-size", "50", "--part", "0/2"]
+    run(*words)
+    (folder / "train" / "shard-00001.json").unlink()
+    assert "made the missing 50 of 100 rows (train 100), part 0/2 of 200 rows, in " in run(*words)[2]
+
+
+def test_a_damaged_shard_is_a_warning_of_one_line(run, hits, tmp_path):
+    folder = Path(shutil.copytree(hits, tmp_path / "hits"))
+    shard = folder / "train" / "shard-00000.h5"
+    shard.write_bytes(shard.read_bytes()[:-1] + b"x")
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        code, out, err = run(*MAKE, folder)
+    assert (code, out) == (0, f"{folder}\n")
+    assert f"cnpgen: warning: a shard is damaged and is made again: {shard} was changed" in err
+    assert "made the missing 182 of 200 rows" in err
+    assert run("validate", folder)[0] == 0
 
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
@@ -336,7 +362,9 @@ def test_a_file_sees_a_single_line(capsys):
     meter(100)
     meter(100)
     meter.close()
-    assert capsys.readouterr().err == "making x: 300 rows, 100 are there already\n"
+    meter.begin("making y", 1)
+    assert capsys.readouterr().err == "making x: 300 rows, 100 there already\nmaking y: 1 row\n"
+    assert meter.rows == 0
 
 
 # list, show

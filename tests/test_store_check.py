@@ -9,8 +9,9 @@ import h5py
 import pytest
 from test_store_example import PLAN, dataset, make_shard, make_shards
 
-from cnpgen.store.check import Finding, check_content, check_dataset
+from cnpgen.store.check import MAKE_AGAIN, Finding, check_content, check_dataset, check_documents
 from cnpgen.store.documents import save_document
+from cnpgen.store.files import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
 from cnpgen.store.plan import save_plan, shards
 
@@ -141,8 +142,10 @@ def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> Non
     save_plan(tmp_path, PLAN)
     for task in shards(PLAN)[:2]:
         make_shard(tmp_path, PLAN, task)
-    message = "missing: the dataset is unfinished: 2 of 3 shards; run make-dataset again"
-    assert check_dataset(tmp_path) == [Finding("manifest.json", message)]
+    message = "is missing: the dataset is unfinished: 2 of 3 shards are there; run the same make-dataset command again"
+    assert check_dataset(tmp_path) == [Finding("manifest.json", message, advice=MAKE_AGAIN)]
+    make_shard(tmp_path, PLAN, shards(PLAN)[2])
+    assert "unfinished: all shards are there, but they were not summed up" in problems(tmp_path)["manifest.json"]
 
 
 def test_damage_to_an_unfinished_dataset_is_found(tmp_path: Path) -> None:
@@ -174,8 +177,34 @@ def test_manifests_that_contradict_the_plan_or_themselves_are_found(tmp_path: Pa
 
 
 def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path) -> None:
-    assert check_dataset(tmp_path) == [Finding("plan.json", "plan.json is missing")]
-    assert check_dataset(tmp_path / "nowhere") == [Finding("plan.json", "plan.json is missing")]
+    assert check_dataset(tmp_path) == [Finding("plan.json", "is missing")]
+    assert check_dataset(tmp_path / "nowhere") == [Finding("plan.json", "is missing")]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_finding_says_what_to_do_and_names_its_file_once(dataset: Path, name: str) -> None:
+    for content in (b"", b"{}", None):
+        if content is None:
+            (dataset / name).unlink()
+        else:
+            (dataset / name).write_bytes(content)
+        for item in check_dataset(dataset):
+            assert item.advice or item == Finding("plan.json", "is missing")
+            assert name not in item.problem
+            assert str(dataset) not in item.problem
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if not name.endswith(".h5") and name != "plan.json"])
+def test_changed_documents_are_found_without_reading_a_shard(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    assert check_documents(dataset, PLAN) == []
+    content = (dataset / name).read_bytes()
+    (dataset / name).write_bytes(content[:-2] + b" " + content[-2:])
+    read = []
+    monkeypatch.setattr("cnpgen.store.check.file_sha256", lambda path: (read.append(path.suffix), file_sha256(path))[1])
+    assert [item.file for item in check_documents(dataset, PLAN)] == [name]
+    assert ".h5" not in read
 
 
 def test_a_dataset_that_is_finished_again_is_good(dataset: Path) -> None:

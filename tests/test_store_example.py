@@ -89,7 +89,7 @@ def dataset(tmp_path: Path) -> Path:
     """A finished dataset."""
     folder = tmp_path / "two-shards-v1"
     make_shards(folder)
-    finalize(folder, notes="Some notes.", citation="A. Author, 2026")
+    finalize(folder, notes="Some notes.")
     return folder
 
 
@@ -125,7 +125,7 @@ def test_a_finished_dataset_has_the_documented_files_and_no_others(dataset: Path
 def test_no_file_depends_on_where_the_dataset_is_or_when_it_was_finished(tmp_path: Path, dataset: Path) -> None:
     again = tmp_path / "elsewhere" / dataset.name
     make_shards(again, replace(PLAN))
-    finalize(again, notes="Some notes.", citation="A. Author, 2026")
+    finalize(again, notes="Some notes.")
     for path in dataset.rglob("*"):
         if path.is_file():
             assert (again / path.relative_to(dataset)).read_bytes() == path.read_bytes(), path

@@ -31,7 +31,6 @@ def test_the_manifest_says_what_the_dataset_is(dataset: Path) -> None:
     assert manifest["recipe"] == PLAN.recipe
     assert manifest["seed"] == str(PLAN.seed)
     assert manifest["plan_fingerprint"] == PLAN.fingerprint
-    assert manifest["citation"] == "A. Author, 2026"
     assert manifest["features"]["start_q"]["shape"] == [3]
     assert manifest["features"]["start_q"]["units"] == "rad"
     assert manifest["features"]["clearance"]["shape"] == []
@@ -74,7 +73,7 @@ def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
 
 def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
     before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
-    finalize(dataset, notes="Some notes.", citation="A. Author, 2026")
+    finalize(dataset, notes="Some notes.")
     assert {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()} == before
     assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
 
@@ -116,7 +115,7 @@ def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_pa
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError) as caught:
         finalize(tmp_path)
-    assert "1 of 3 shards; run make-dataset again" in str(caught.value)
+    assert "1 of 3 shards are there; run the same make-dataset command again" in str(caught.value)
     assert "train/shard-00000.json is missing" in str(caught.value)
     assert "validation/shard-00000.json is missing" in str(caught.value)
     assert "shard-00001" not in str(caught.value)

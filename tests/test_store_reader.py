@@ -58,7 +58,7 @@ def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
     save_plan(tmp_path, PLAN)
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
-    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards; run make-dataset again"):
+    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run the same"):
         open_dataset(tmp_path)
     opened = open_dataset(tmp_path, allow_partial=True)
     assert opened.manifest is None

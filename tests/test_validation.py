@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, tiny_recipe
 
-from cnpgen.errors import MachineError, UsageError
+from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.library import load_problem
 from cnpgen.make import make_dataset
 from cnpgen.robots.robot import load_robot
@@ -98,7 +98,7 @@ def test_a_report_can_be_read_and_stored(tiny: Tiny):
     text = report.summary()
     assert "660 rows, no findings" in text
     assert "recomputed with Pinocchio and Coal: 660 rows, 0 out" in text
-    assert "made again: 1 blocks, 1 identical to the bit" in text
+    assert "made again: 1 block, 1 identical to the bit" in text
 
 
 def test_progress_is_told_of_every_shard(tiny: Tiny):
@@ -110,7 +110,7 @@ def test_progress_is_told_of_every_shard(tiny: Tiny):
 def test_an_unfinished_dataset_is_checked_as_far_as_it_goes(tmp_path):
     make_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out", shard_size=TINY_SHARD, workers=1, part=(0, 2))
     report = validate_dataset(tmp_path / "out", deep=True, regenerate=2, workers=1)
-    assert report.rows == 350
+    assert report.rows == 500
     assert list(named(report)) == [MANIFEST]
     assert report.identical == 2
     assert not report.ok
@@ -349,7 +349,7 @@ def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(tiny: 
 
 
 def test_folders_that_are_none_and_negative_counts_are_refused(damaged: Path, tmp_path):
-    with pytest.raises(UsageError, match="is not a folder"):
+    with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
         validate_dataset(tmp_path / "nowhere")
     with pytest.raises(UsageError, match="regenerate must not be negative, got -1"):
         validate_dataset(damaged, regenerate=-1)
@@ -357,10 +357,10 @@ def test_folders_that_are_none_and_negative_counts_are_refused(damaged: Path, tm
         validate_dataset(damaged, deep=True, workers=0)
 
 
-def test_a_folder_that_holds_no_dataset_has_no_plan(tmp_path):
-    report = validate_dataset(tmp_path, deep=True, regenerate=3)
-    assert named(report) == {"plan.json": "plan.json is missing"}
-    assert report.rows == 0
+def test_a_folder_that_holds_something_else_is_refused(tmp_path):
+    (tmp_path / "mine.txt").write_text("no dataset")
+    with pytest.raises(DatasetError, match=r"is not a dataset of cnpgen: it has no plan.json"):
+        validate_dataset(tmp_path, deep=True, regenerate=3)
 
 
 def test_a_backend_that_does_not_work_here_is_a_machine_error(damaged: Path, monkeypatch, fresh_compiler):

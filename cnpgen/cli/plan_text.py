@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.describe import table
-from cnpgen.make import plan_dataset
+from cnpgen.make_plan import plan_dataset
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.plan import DatasetPlan, load_plan, shards
 from cnpgen.store.record import pending

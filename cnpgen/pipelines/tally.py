@@ -55,9 +55,9 @@ class Tally:
         self.tried += stop - start
         self.accepted += len(wanted)
         for field in self._maps:
-            cells = _cells(batch.drawn[field.name], field)
-            self._drawn[field.name] += np.bincount(cells[start:stop], minlength=CELLS * CELLS)
-            self._kept[field.name] += np.bincount(cells[wanted], minlength=CELLS * CELLS)
+            cells = _cells(batch.drawn[field.name][:, start:stop], field)
+            self._drawn[field.name] += np.bincount(cells, minlength=CELLS * CELLS)
+            self._kept[field.name] += np.bincount(cells[wanted - start], minlength=CELLS * CELLS)
         attempts = np.diff(wanted, prepend=start - 1 - self._waiting).astype(np.int64)
         self._waiting = stop - 1 - int(wanted[-1]) if len(wanted) else self._waiting + stop - start
         return attempts

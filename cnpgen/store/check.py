@@ -28,6 +28,11 @@ from cnpgen.store.summary import summarise, unfinished
 _LISTED = (PLAN, STATS, CARD, CROISSANT)
 _NOTHING = "(nothing)"
 
+MAKE_AGAIN = "run the same make-dataset command again: it makes what is damaged or missing and keeps the rest"
+REPLACE = "nothing else says what the dataset was to be: make it again with --force"
+DELETE = "delete this shard and the .json beside it, then run the same make-dataset command again"
+REMOVE = "move it elsewhere"
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -37,11 +42,13 @@ class Finding:
         file: Path relative to the dataset's folder.
         problem: What is wrong with it.
         note: Whether it is only worth knowing: the dataset is good nevertheless.
+        advice: What to do about it.
     """
 
     file: str
     problem: str
     note: bool = False
+    advice: str = ""
 
     def __str__(self) -> str:
         return f"{self.file}: {self.problem}"
@@ -67,7 +74,7 @@ def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) ->
     try:
         plan = load_plan(folder)
     except DatasetError as error:
-        return [Finding(PLAN, _reason(error, folder))]
+        return [Finding(PLAN, _reason(error, folder / PLAN), advice=REPLACE if (folder / PLAN).exists() else "")]
     findings, manifest = _check_manifest(folder, plan)
     entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
     for task in shards(plan):
@@ -78,28 +85,44 @@ def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) ->
     return findings + list(_extras(folder, plan))
 
 
-def _reason(error: DatasetError, folder: Path) -> str:
-    """Return an error's message without the folder, which the caller knows."""
-    return str(error).replace(f"{folder}/", "")
+def check_documents(folder: Path, plan: DatasetPlan) -> list[Finding]:
+    """Check what sums up a finished dataset: the manifest, the files it lists and the sidecars; no shard is read.
+
+    Args:
+        folder: The dataset's folder.
+        plan: Its plan.
+
+    Raises:
+        MachineError: The system would not let us read something.
+    """
+    findings, manifest = _check_manifest(folder, plan)
+    for entry in _shard_entries(manifest).values():
+        findings += _check_digest(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
+    return findings
+
+
+def _reason(error: DatasetError, path: Path) -> str:
+    """Return an error's message without the file, which the caller names."""
+    return str(error).removeprefix(f"{path} ").removeprefix(f"{path}: ")
 
 
 def _check_manifest(folder: Path, plan: DatasetPlan) -> tuple[list[Finding], dict[str, Any]]:
     """Check the manifest and the files it lists; return it empty if it cannot be relied upon."""
     if not (folder / MANIFEST).exists():
         summary = summarise(folder, plan, allow_partial=True)
-        return [Finding(MANIFEST, f"missing: the dataset is {unfinished(summary)}")], {}
+        return [Finding(MANIFEST, f"is missing: the dataset is {unfinished(summary)}", advice=MAKE_AGAIN)], {}
     try:
         manifest = load_manifest(folder)
     except DatasetError as error:
-        return [Finding(MANIFEST, _reason(error, folder))], {}
+        return [Finding(MANIFEST, _reason(error, folder / MANIFEST), advice=MAKE_AGAIN)], {}
     if manifest["plan_fingerprint"] != plan.fingerprint:
-        return [Finding(MANIFEST, "is of another plan than plan.json")], {}
+        return [Finding(MANIFEST, "is of another plan than plan.json", advice=MAKE_AGAIN)], {}
     entries = _shard_entries(manifest)
-    findings = (
-        [] if entries.keys() == {task.file for task in shards(plan)} else [Finding(MANIFEST, "lists other shards")]
-    )
+    findings = []
+    if entries.keys() != {task.file for task in shards(plan)}:
+        findings.append(Finding(MANIFEST, "lists other shards than the plan", advice=MAKE_AGAIN))
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
-        findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists"))
+        findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", advice=MAKE_AGAIN))
     for name in _LISTED:
         findings += _check_digest(folder, name, manifest["files"][name]["sha256"])
     return findings, manifest
@@ -112,9 +135,9 @@ def _shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def _check_digest(folder: Path, name: str, sha256: str) -> list[Finding]:
     """Compare a file with its recorded digest."""
     if not (folder / name).is_file():
-        return [Finding(name, "is missing")]
+        return [Finding(name, "is missing", advice=MAKE_AGAIN)]
     if file_sha256(folder / name) != sha256:
-        return [Finding(name, "was changed: its sha256 is not the recorded one")]
+        return [Finding(name, "was changed: its sha256 is not the recorded one", advice=MAKE_AGAIN)]
     return []
 
 
@@ -136,7 +159,7 @@ def check_shard(folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[st
     path = folder / task.file
     findings, expected = _check_sidecar(folder, plan, task, entry)
     if not path.is_file():
-        return [*findings, Finding(task.file, "is missing")]
+        return [*findings, Finding(task.file, "is missing", advice=MAKE_AGAIN)]
     if expected is None:  # nobody knows what the file should be, and findings says why
         return findings
     damage = _check_file(folder, task.file, *expected)
@@ -149,7 +172,7 @@ def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding
     """Compare a file with its recorded size and digest."""
     found = (folder / name).stat().st_size
     if found != size:
-        return [Finding(name, f"has {found} bytes instead of {size}")]
+        return [Finding(name, f"has {found} bytes instead of {size}", advice=MAKE_AGAIN)]
     return _check_digest(folder, name, sha256)
 
 
@@ -169,10 +192,11 @@ def _check_sidecar(
     try:
         record = load_record(folder, task)
     except DatasetError as error:
-        return [Finding(task.sidecar, _reason(error, folder))], expected
+        return [Finding(task.sidecar, _reason(error, folder / task.sidecar), advice=MAKE_AGAIN)], expected
     findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
     if record.plan_fingerprint != plan.fingerprint:
-        findings.append(Finding(task.sidecar, f"belongs to another plan ({record.plan_fingerprint[:12]}...)"))
+        text = f"belongs to another plan ({record.plan_fingerprint[:12]}...)"
+        findings.append(Finding(task.sidecar, text, advice=MAKE_AGAIN))
     return findings, expected or (record.bytes, record.sha256)
 
 
@@ -191,7 +215,7 @@ def check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Find
     try:
         attributes, schema = read_attributes(path), read_schema(path)
     except DatasetError as error:
-        return [Finding(task.file, _reason(error, folder))]
+        return [Finding(task.file, _reason(error, path), advice=DELETE)]
     expected = {"format": FORMAT, "format_version": FORMAT_VERSION, **shard_attributes(plan, task)}
     problems = [
         f"its {name} is {attributes.get(name)!r}, the plan says {value!r}"
@@ -204,7 +228,7 @@ def check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Find
     for field in plan.fields:
         if field.name in schema:
             problems += _check_field(field, schema[field.name], plan, task)
-    return [Finding(task.file, problem) for problem in problems]
+    return [Finding(task.file, problem, advice=DELETE) for problem in problems]
 
 
 def _check_field(field: Field, found: StoredField, plan: DatasetPlan, task: ShardTask) -> list[str]:
@@ -237,4 +261,4 @@ def _extras(folder: Path, plan: DatasetPlan) -> Iterator[Finding]:
             if name not in known:
                 loaded = parent != folder and item.suffix == ".h5"
                 text = "is not part of the dataset" + (", but loaders would read it" if loaded else "")
-                yield Finding(name, text, note=not loaded)
+                yield Finding(name, text, note=not loaded, advice=REMOVE)

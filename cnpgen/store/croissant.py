@@ -45,13 +45,12 @@ _CONTEXT: dict[str, Any] = {
 }
 
 
-def croissant_document(summary: Summary, *, created: str, citation: str) -> dict[str, Any]:
+def croissant_document(summary: Summary, *, created: str) -> dict[str, Any]:
     """Return the content of ``croissant.json``.
 
     Args:
         summary: The finished shards.
         created: When the dataset was finished, ISO 8601.
-        citation: How to cite it.
     """
     plan = summary.plan
     document: dict[str, Any] = {
@@ -65,8 +64,6 @@ def croissant_document(summary: Summary, *, created: str, citation: str) -> dict
     }
     if plan.license:
         document["license"] = f"https://spdx.org/licenses/{plan.license}"
-    if citation:
-        document["citeAs"] = citation
     return document | {"distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records]}
 
 

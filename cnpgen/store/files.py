@@ -20,6 +20,9 @@ _HINTS = {
     errno.EPERM: "choose a folder that you may write to",
     errno.ENOTDIR: "a file is where a folder should be; choose another folder",
     errno.EEXIST: "a file is where a folder should be; choose another folder",
+    errno.ENOENT: "choose a folder that can be made",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "choose another folder",
     errno.EMFILE: "too many open files (see ulimit -n)",
 }
 

@@ -23,7 +23,7 @@ FORMAT = "cnpgen-dataset"
 FORMAT_VERSION = 1
 
 
-def finalize(folder: Path, *, notes: str = "", citation: str = "") -> dict[str, Any]:
+def finalize(folder: Path, *, notes: str = "") -> dict[str, Any]:
     """Sum up the shards of a dataset: statistics, card, Croissant and, last, the manifest.
 
     The same shards give the same files; processes that find all shards made may do it at once.
@@ -31,7 +31,6 @@ def finalize(folder: Path, *, notes: str = "", citation: str = "") -> dict[str, 
     Args:
         folder: The dataset's folder.
         notes: Text about the dataset to include in its card, Markdown.
-        citation: How to cite the dataset.
 
     Returns:
         The manifest.
@@ -45,9 +44,9 @@ def finalize(folder: Path, *, notes: str = "", citation: str = "") -> dict[str, 
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
     write_file(folder / CARD, card_text(summary, folder=folder.resolve().name, notes=notes))
-    croissant = plain(croissant_document(summary, created=created, citation=citation))
+    croissant = plain(croissant_document(summary, created=created))
     write_file(folder / CROISSANT, render(croissant) + "\n")
-    manifest = _manifest(folder, summary, created=created, citation=citation)
+    manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
     _remove_work(folder / WORK)
     return cast(dict[str, Any], plain(manifest))
@@ -85,7 +84,7 @@ def _created(summary: Summary) -> str:
         raise DatasetError(f"cannot tell when the dataset was made: {message} ({error})") from error
 
 
-def _manifest(folder: Path, summary: Summary, *, created: str, citation: str) -> dict[str, Any]:
+def _manifest(folder: Path, summary: Summary, *, created: str) -> dict[str, Any]:
     """Build the manifest; the files that it lists must be on the disk."""
     plan = summary.plan
     return {
@@ -96,7 +95,6 @@ def _manifest(folder: Path, summary: Summary, *, created: str, citation: str) ->
         "title": plan.title,
         "created": created,
         "license": plan.license,
-        "citation": citation,
         "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
         "plan_fingerprint": plan.fingerprint,
         **_origin(summary),

@@ -176,6 +176,23 @@ def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardReco
     return record
 
 
+def check_committed(folder: Path, task: ShardTask, fingerprint: str) -> None:
+    """Read a shard's sidecar and the shard itself and make sure that they are what was written.
+
+    Args:
+        folder: The dataset's folder.
+        task: Which shard.
+        fingerprint: The plan's fingerprint.
+
+    Raises:
+        DatasetError: Like :func:`load_committed`, or the shard was changed.
+        MachineError: The system would not let us read it.
+    """
+    record = load_committed(folder, task, fingerprint)
+    if file_sha256(folder / task.file) != record.sha256:
+        raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
+
+
 def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
     """Whether a shard is made: its sidecar is whole and of this plan, and its file has the recorded size."""
     try:

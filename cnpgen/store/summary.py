@@ -85,7 +85,14 @@ def summarise(folder: Path, plan: DatasetPlan, *, allow_partial: bool = False) -
 
 def unfinished(summary: Summary) -> str:
     """Say how far an unfinished dataset is and what to do."""
-    return f"unfinished: {len(summary.records)} of {summary.n_shards} shards; run make-dataset again"
+    return f"unfinished: {progress_text(summary)}; run the same make-dataset command again"
+
+
+def progress_text(summary: Summary) -> str:
+    """Say how many shards of an unfinished dataset are there."""
+    if summary.problems:
+        return f"{len(summary.records)} of {summary.n_shards} shards are there"
+    return "all shards are there, but they were not summed up"
 
 
 def stats_document(summary: Summary) -> dict[str, Any]:

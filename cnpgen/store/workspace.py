@@ -1,43 +1,135 @@
-"""Opening a folder to make a dataset in it, and clearing one that is to be replaced."""
+"""The folder of a dataset that is being made: whose it is, opening it, and clearing what is to be replaced."""
 
+import errno
+import os
+import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files import machine_error, sweep
-from cnpgen.store.layout import PLAN, WORK
-from cnpgen.store.plan import DatasetPlan, load_plan, save_plan, to_json
+from cnpgen.store.files import machine_error, read_file, sweep
+from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
+from cnpgen.store.plan import DatasetPlan, load_plan, to_json, write_plan
 
-_COMPARED = ("name", "version", "seed", "splits", "dtype", "backend", "shard_size", "recipe_sha256")
-_DOCUMENTS = (PLAN, "manifest.json", "stats.json", "croissant.json", "README.md")
+_COMPARED = ("name", "version", "seed", "dtype", "backend", "shard_size", "recipe_sha256")
+_SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
+_SHARD = re.compile(r"shard-\d{5,}\.(h5|json)")
+_MARK = re.compile(rb'\{\s*"format": "cnpgen-')
+
+
+def check_place(folder: Path) -> None:
+    """Refuse a folder in which no dataset can be made, before any work is done for it.
+
+    Raises:
+        UsageError: It is a file, lies below one, or holds something that is not a dataset of cnpgen.
+        MachineError: It cannot be written.
+    """
+    try:
+        above = [folder.absolute(), *folder.absolute().parents]
+        there = next(path for path in above if path.exists())
+        if not there.is_dir():
+            raise UsageError(f"{there} is a file, not a folder; choose another --out")
+        if there == above[0] and not is_dataset(folder) and any(item.name != WORK for item in folder.iterdir()):
+            raise UsageError(f"{folder} is not empty and not a dataset of cnpgen; choose another --out")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise machine_error("write to", folder, error) from error
+
+
+def is_dataset(folder: Path) -> bool:
+    """Whether a folder holds a dataset of cnpgen, finished or not, damaged or not: one of its documents says so."""
+    sidecars = (path for path in _shard_files(folder) if path.suffix == ".json")
+    return any(_is_ours(path) for path in (folder / PLAN, folder / MANIFEST, folder / STATS, *sidecars))
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return _MARK.match(file.read(64)) is not None
+    except OSError:
+        return False
+
+
+def _shard_files(folder: Path) -> Iterator[Path]:
+    """List the shards and sidecars in a folder, of whatever splits."""
+    return (path for path in folder.glob("*/shard-*.*") if _SHARD.fullmatch(path.name))
 
 
 def open_workspace(folder: Path, plan: DatasetPlan) -> None:
     """Create the folder with its plan, or make sure that it holds the same plan already.
+
+    A plan of which nothing was made yet gives way to the new one: it costs nothing.
 
     Raises:
         UsageError: The folder holds something else.
         MachineError: The folder cannot be written.
         DatasetError: The plan in the folder is damaged.
     """
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"{folder} is a file, not a folder; choose another --out")
-    if (folder / PLAN).exists():
-        found = load_plan(folder)
-        if found.fingerprint != plan.fingerprint:
-            raise UsageError(
-                f"{folder} holds another dataset ({_difference(found, plan)});"
-                " choose another --out, or replace it with --force"
-            )
-    elif folder.is_dir() and any(path.name not in (WORK, PLAN) for path in folder.iterdir()):
-        raise UsageError(f"{folder} is not empty and not a dataset of cnpgen; choose another --out")
+    check_place(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise machine_error("create", folder, error) from error
-    if not (folder / PLAN).exists():
-        save_plan(folder, plan)
+    if not _holds(folder, plan):
+        for name in _SUMMARIES:
+            (folder / name).unlink(missing_ok=True)
+        write_plan(folder, plan)
     sweep(folder / WORK)
+
+
+def _holds(folder: Path, plan: DatasetPlan) -> bool:
+    """Whether a folder has the plan already; if not, it may be written.
+
+    Raises:
+        UsageError: It has rows of another plan.
+        DatasetError: It has rows, and its plan is damaged.
+    """
+    used = any(_shard_files(folder))
+    try:
+        found = load_plan(folder)
+    except DatasetError as error:
+        if used:
+            raise DatasetError(f"{error}; --force replaces the whole dataset") from error
+        return False
+    if found.fingerprint == plan.fingerprint:
+        return True
+    if used:
+        raise UsageError(f"{folder} {_refusal(found, plan)}")
+    return False
+
+
+def _refusal(found: DatasetPlan, wanted: DatasetPlan) -> str:
+    """Say why a dataset cannot become another one, and what to do."""
+    old, new = to_json(found), to_json(wanted)
+    differences = [f"{key} {old[key]} instead of {new[key]}" for key in _COMPARED if old[key] != new[key]]
+    if not differences and found.splits != wanted.splits:
+        return (
+            f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; a dataset does not grow or shrink,"
+            " but the rows that both sizes have are the same: choose another --out, or replace it with --force"
+        )
+    text = "; ".join(differences[:3]) or "made by another version of cnpgen"
+    return f"holds another dataset ({text}); choose another --out, or replace it with --force"
+
+
+def _sizes(plan: DatasetPlan) -> str:
+    splits = ", ".join(f"{split} {rows:,}" for split, rows in plan.splits.items())
+    return f"{sum(plan.splits.values()):,} rows ({splits})"
+
+
+def require_plan(folder: Path, plan: DatasetPlan) -> None:
+    """Make sure that the folder still belongs to a plan: another process may have replaced the dataset meanwhile.
+
+    Raises:
+        UsageError: It has another plan now, or none.
+    """
+    try:
+        mine = plan.fingerprint.encode() in read_file(folder / PLAN)
+    except DatasetError:
+        mine = False
+    if not mine:
+        raise UsageError(f"{folder} was given to another dataset while this one was made; choose another --out")
 
 
 def clear_dataset(folder: Path) -> None:
@@ -49,42 +141,41 @@ def clear_dataset(folder: Path) -> None:
     """
     if not folder.is_dir() or not any(folder.iterdir()):
         return
-    if not (folder / PLAN).is_file():
+    if not is_dataset(folder):
         raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
-    try:
-        splits = [folder / split for split in load_plan(folder).splits]
-    except DatasetError:  # a damaged plan: what looks like a split is one
-        splits = sorted({path.parent for path in folder.glob("*/shard-*.json")})
+    splits = _splits(folder)
     foreign = _foreign(folder, splits)
     if foreign:
         raise UsageError(
             f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
         )
     try:
-        for name in ("manifest.json", *_DOCUMENTS):  # the manifest first: what is half deleted must not look complete
-            (folder / name).unlink(missing_ok=True)
+        (folder / MANIFEST).unlink(missing_ok=True)  # first: what is half deleted must not look complete
         for split in splits:
-            for path in split.glob("shard-*.*"):
+            for path in split.iterdir():
                 path.unlink()
-            if split.is_dir() and not any(split.iterdir()):
-                split.rmdir()
+            split.rmdir()
         shutil.rmtree(folder / WORK, ignore_errors=True)
+        for name in (*_SUMMARIES, PLAN):  # last: what is half deleted must still look like a dataset
+            (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error
 
 
+def _splits(folder: Path) -> list[Path]:
+    """List the folders of the splits: those that the plan names, or, where it is damaged, those with shards."""
+    try:
+        splits = [folder / split for split in load_plan(folder).splits]
+    except DatasetError:
+        splits = sorted({path.parent for path in _shard_files(folder)})
+    return [split for split in splits if split.is_dir()]
+
+
 def _foreign(folder: Path, splits: list[Path]) -> Path | None:
     """Return a file that --force must not delete and that would be in the way, if there is one."""
-    known = {*_DOCUMENTS, WORK, *(split.name for split in splits)}
+    known = {*_SUMMARIES, PLAN, WORK, *(split.name for split in splits)}
     candidates = [path for path in folder.iterdir() if path.name not in known]
     for split in splits:
-        if split.is_dir():
-            candidates += [path for path in split.iterdir() if not path.match("shard-*.*")]
+        candidates += [path for path in split.iterdir() if not _SHARD.fullmatch(path.name)]
+        candidates += [split] if split.is_symlink() else []
     return min(candidates, default=None)
-
-
-def _difference(found: DatasetPlan, wanted: DatasetPlan) -> str:
-    """Name the first few settings in which two plans differ."""
-    old, new = to_json(found), to_json(wanted)
-    differences = [f"{key} {old[key]} instead of {new[key]}" for key in _COMPARED if old[key] != new[key]]
-    return "; ".join(differences[:3]) or "made by another version of cnpgen"
