@@ -1,7 +1,8 @@
 """Stage: certified samples, each with a plan that Pinocchio and Coal call valid."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
-from cnpgen.recipes import DatasetRecipe, TrajectorySpec
+from cnpgen.recipes import DatasetRecipe, Problem, TrajectorySpec
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.threads import one_thread
 from cnpgen.trajectory.boundary import Boundary
@@ -18,6 +19,7 @@ from cnpgen.trajectory.motion import Motion
 
 if TYPE_CHECKING:
     from cnpgen.refine.task import Refined
+    from cnpgen.robots.robot import Robot
     from cnpgen.verdict.verdict import Verdict
 
 Array = NDArray[np.float64]
@@ -110,6 +112,37 @@ def _write(batch: Batch, found: "list[Refined]", spec: TrajectorySpec, n: int) -
     batch["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
     batch["duration"] = motion.duration()[None]
     batch.reject(np.array([each.valid for each in found], bool), NO_PLAN)
+
+
+def check_plans(problem: Problem, robot: "Robot", columns: Mapping[str, NDArray[Any]]) -> list[str]:
+    """Judge the plans that rows of a certified dataset hold.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        columns: Field -> values, shape (rows, width) or (rows,).
+
+    Returns:
+        What is wrong; nothing where rows hold no plans.
+    """
+    from cnpgen.verdict.judge import judge
+
+    if "path_control_points" not in columns:
+        return []
+    rows, spec = len(columns["start_q"]), problem.trajectory
+    motion = Motion(
+        columns["path_control_points"].reshape(rows, -1, robot.n), columns["rate_control_points"], spec.degree
+    )
+    boundary = Boundary(*(columns[name] for name in (*_ENDS, "goal_ddq") if name in columns))
+    verdicts = judge(problem, robot, motion, boundary, columns["start_xyz"], columns["goal_xyz"])
+    wrong = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
+    problems = []
+    if wrong:
+        row, reason = wrong[0]
+        problems.append(f"{len(wrong)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
+    if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
+        problems.append("durations are not those of the plans")
+    return problems
 
 
 def certified(recipe: DatasetRecipe) -> DatasetRecipe:

@@ -24,8 +24,10 @@ LAYERS = (
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
     ("interop", "certification"),
+    ("network", "planner", "training"),
     ("make_shard", "make_plan", "make"),
-    ("validation", "consistency", "shard_checks", "deep_check", "regeneration", "inspection", "describe", "plots", "doctor"),
+    ("consistency", "shard_checks", "deep_check", "regeneration"),
+    ("validation", "inspection", "describe", "plots", "doctor"),
     ("evaluation", "refinement", "solving"),
     ("cli", "__main__", "__init__"),
 )

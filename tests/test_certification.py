@@ -1,0 +1,98 @@
+"""Certified datasets: every row comes with a plan that holds, in the same shards, resumable and provable like all."""
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.certification import NO_PLAN, CertifiedPlan, certified, check_plans
+from cnpgen.cli.main import main
+from cnpgen.errors import RecipeError
+from cnpgen.inspection import inspect_dataset
+from cnpgen.library import load_dataset_recipe
+from cnpgen.make import make_dataset
+from cnpgen.plans.problem import record_problem
+from cnpgen.refinement import refine_plans
+from cnpgen.robots.robot import load_robot
+from cnpgen.solving import problems_of_rows
+from cnpgen.store.files import file_sha256
+from cnpgen.store.reader import open_dataset
+from cnpgen.validation import validate_dataset
+
+ROWS = 12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("certified") / "hits"
+    return make_dataset("airhockey-hit", out, n=ROWS, certify=True, workers=1, shard_size=8).folder
+
+
+def test_every_row_holds_a_plan_that_deep_validation_judges(folder: Path) -> None:
+    assert validate_dataset(folder, deep=True, regenerate=1, workers=1).ok
+    rows = open_dataset(folder).read("train")
+    assert rows["path_control_points"].shape == (11, 15 * 6)
+    assert rows["rate_control_points"].shape == (11, 20)
+    assert (rows["duration"] > 0.05).all()
+    with h5py.File(folder / "train" / "shard-00000.h5") as file:
+        assert file["path_control_points"].attrs["role"] == "target"
+        assert "(15, 6)" in file["path_control_points"].attrs["long_name"]
+
+
+def test_the_plans_are_those_that_solve_finds(folder: Path) -> None:
+    problem = load_dataset_recipe("airhockey-hit").pipeline.problem
+    rows = open_dataset(folder).read("validation")
+    found = refine_plans(problems_of_rows(record_problem(problem), rows)).plans
+    np.testing.assert_array_equal(found.path_control_points.reshape(len(found), -1), rows["path_control_points"])
+
+
+def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    make_dataset("airhockey-hit", again, n=ROWS, certify=True, part=(1, 2), shard_size=8)
+    make_dataset("airhockey-hit", again, n=ROWS, certify=True, workers=2, shard_size=8)
+    shards = sorted(path.relative_to(folder) for path in folder.rglob("*.h5"))
+    assert [file_sha256(folder / name) for name in shards] == [file_sha256(again / name) for name in shards]
+
+
+def test_samples_without_a_plan_are_counted_under_their_reason(folder: Path) -> None:
+    assert NO_PLAN in open_dataset(folder).manifest["yield"]["rejections"] or NO_PLAN in str(inspect_dataset(folder))
+
+
+def test_a_plan_that_does_not_hold_is_found(folder: Path, tmp_path: Path) -> None:
+    problem = load_dataset_recipe("airhockey-hit").pipeline.problem
+    robot, rows = load_robot(problem), dict(open_dataset(folder).read("train"))
+    assert check_plans(problem, robot, rows) == []
+    path = rows["path_control_points"].copy()
+    path[3, 40] += 0.1
+    assert (
+        "1 of 11 plans are not valid, the first one is that of row 3"
+        in check_plans(problem, robot, rows | {"path_control_points": path})[0]
+    )
+    assert check_plans(problem, robot, rows | {"duration": 2 * rows["duration"]}) == [
+        "durations are not those of the plans"
+    ]
+    assert check_plans(problem, robot, {"start_q": rows["start_q"]}) == []
+
+
+def test_float32_is_refused_since_plans_would_miss_their_ends(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="float64"):
+        make_dataset("airhockey-hit", tmp_path / "out", n=4, certify=True, dtype="float32")
+
+
+def test_certifying_adds_one_stage_and_a_name_and_only_once() -> None:
+    plain = load_dataset_recipe("airhockey-hit")
+    once = certified(plain)
+    assert once.name == "airhockey-hit-certified"
+    assert isinstance(once.pipeline.stage[-1], CertifiedPlan)
+    assert certified(once) is once
+
+
+def test_the_command_makes_a_certified_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["make-dataset", "heavy-object", "--n", "2", "--certify", "--out", str(out), "--workers", "1"]) == 0
+    assert main(["show", "airhockey-hit"]) == 0
+    assert main(["validate", str(out), "--deep"]) == 0
+    shutil.rmtree(out)
+    assert "0 rows out" in capsys.readouterr().out
