@@ -1,9 +1,13 @@
-"""Whether the documents of a dataset agree with each other, beyond what their checksums tell."""
+"""What the documents of a dataset say together: the recipe in its plan, and whether they agree beyond checksums."""
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.recipes import resolved_digest
+from cnpgen.library import restore_dataset_recipe
+from cnpgen.recipes import DatasetRecipe, resolved_digest
 from cnpgen.store.check import Finding
 from cnpgen.store.documents import load_document, plain
 from cnpgen.store.layout import PLAN, STATS
@@ -30,3 +34,15 @@ def check_statistics(folder: Path, plan: DatasetPlan) -> list[Finding]:
         return []
     wrong = [key for key in expected if document.get(key) != expected[key]]
     return [Finding(STATS, f"does not sum up the shards' records: {', '.join(wrong)} differ")] if wrong else []
+
+
+@contextmanager
+def restored(plan: DatasetPlan) -> Iterator[DatasetRecipe]:
+    """Rebuild the recipe from a plan, its URDF in a temporary folder that is gone when the block ends.
+
+    Raises:
+        RecipeError: It does not fit this version of cnpgen.
+        PluginError: It needs packages that are not installed.
+    """
+    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+        yield restore_dataset_recipe(dict(plan.recipe), str(plan.robot["urdf"]), Path(folder))

@@ -1,0 +1,95 @@
+"""The deep check of a dataset: every row by Pinocchio and Coal and by itself, and whether rows stand there twice."""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.certification import check_plans
+from cnpgen.consistency import restored
+from cnpgen.errors import CnpgenError
+from cnpgen.robots.robot import load_robot
+from cnpgen.shard_checks import check_numbers
+from cnpgen.store.check import DELETE, Finding
+from cnpgen.store.plan import DatasetPlan, ShardTask
+from cnpgen.store.record import load_record
+from cnpgen.store.shard import read_shard
+from cnpgen.verify.report import RowReport, merge
+from cnpgen.verify.rows import verify_rows
+from cnpgen.workers import share_out
+
+_ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+
+
+def check_rows(
+    folder: Path, plan: DatasetPlan, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
+) -> tuple[RowReport | None, list[Finding]]:
+    """Recompute every row, shard by shard.
+
+    Args:
+        folder: The dataset.
+        plan: Its plan.
+        tasks: The shards to read.
+        workers: Processes.
+        progress: Called with the rows of every shard that was read.
+
+    Returns:
+        What Pinocchio and Coal say of all rows, or None if none could be read; and what is wrong, by file.
+    """
+    reports, findings, keys = [], [], [np.empty(0, np.uint64)]
+    with closing(share_out(partial(_verify_shard, folder, plan), tasks, workers, ordered=True)) as results:
+        for task, result in zip(tasks, results, strict=True):
+            findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
+            if result.report is not None:
+                reports.append(result.report)
+            keys.append(result.keys)
+            if progress is not None:
+                progress(task.rows)
+    every = np.concatenate(keys)
+    twice = len(every) - len(np.unique(every))
+    if twice:
+        findings.append(Finding("(all splits)", f"{twice} rows stand in the dataset more than once"))
+    return merge(reports) if reports else None, findings
+
+
+@dataclass(frozen=True)
+class _ShardCheck:
+    """What the deep check found in one shard.
+
+    Attributes:
+        report: What Pinocchio and Coal say, or None if the shard cannot be read.
+        problems: What is wrong with it.
+        keys: A hash of the boundary states of every row, shape (rows,).
+    """
+
+    report: RowReport | None
+    problems: list[str]
+    keys: NDArray[np.uint64]
+
+
+def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardCheck:
+    """Verify one shard; a shard that cannot be read is a finding, not an exception."""
+    try:
+        columns = read_shard(folder / task.file)
+        record = load_record(folder, task)
+    except CnpgenError as error:
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64))
+    with restored(plan) as recipe:
+        problem = recipe.pipeline.problem
+        robot = load_robot(problem)
+        report = verify_rows(problem, robot, columns, dtype=plan.dtype)
+        problems = check_plans(problem, robot, columns)
+    problems += check_numbers(plan, task, columns, record)
+    problems += [
+        f"{check.name}: {check.rows_out} rows out, worst {check.worst:.3g} {check.unit}"
+        f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}"
+        for check in report.failed
+    ]
+    ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
+    bits = np.ascontiguousarray(np.concatenate(ends, axis=1), np.float64).view(np.uint64)
+    keys = (bits * np.resize(_ODD, bits.shape[1])).sum(axis=1, dtype=np.uint64)
+    return _ShardCheck(report, problems, keys)

@@ -1,0 +1,94 @@
+"""Blocks of a dataset made again from its seed, to compare them with what is stored."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.consistency import restored
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels.library import Backend, choose_backend
+from cnpgen.make_shard import blocks_of, shard_columns, versions
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.recipes import DatasetRecipe, recipe_digest
+from cnpgen.store.check import Finding
+from cnpgen.store.plan import REVISION, DatasetPlan, ShardTask
+from cnpgen.store.reader import StoredDataset
+
+PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
+PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32
+
+
+def make_again(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> tuple[int, int, list[Finding]]:
+    """Make random blocks again.
+
+    Args:
+        folder: The dataset.
+        plan: Its plan.
+        tasks: The shards whose blocks may be chosen.
+        count: How many blocks to choose.
+
+    Returns:
+        How many blocks were made, how many of them are the same to the bit, and what differs by more than arithmetic.
+
+    Raises:
+        MachineError: The backend that made the dataset does not work here.
+        UsageError: The blocks of this version have another size.
+    """
+    size = plan.block_rows
+    pieces = [(task, block) for task in tasks for block in blocks_of(task, size)]
+    backend, cache_folder = backend_of(folder, plan)
+    dataset = StoredDataset(folder, plan, None)  # whatever became of the manifest
+    chosen = np.random.default_rng().permutation(len(pieces))[:count]
+    identical, findings = 0, []
+    with restored(plan) as recipe:
+        prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=plan.dtype)
+        if prepared.block_rows != size:
+            raise UsageError(f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}")
+        for task, block in (pieces[index] for index in chosen):
+            start = max(block * size, task.first_row)
+            stop = min((block + 1) * size, task.first_row + task.rows)
+            again, _ = next(shard_columns(prepared, plan, [ShardTask(task.split, task.index, start, stop - start)]))
+            same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
+            identical += same
+            if problem:
+                text = f"block {block} made again from the seed: {problem}{_explanation(plan, recipe)}"
+                findings.append(Finding(task.file, text))
+    return len(chosen), identical, findings
+
+
+def backend_of(folder: Path, plan: DatasetPlan) -> tuple[Backend, Path]:
+    """Return the backend that made a dataset, and its cache folder.
+
+    Raises:
+        MachineError: It does not work here.
+    """
+    try:
+        return choose_backend(plan.backend)
+    except MachineError as error:
+        raise MachineError(
+            f"{folder} was made by the {plan.backend} backend, which does not work here ({error}): its blocks cannot"
+            " be made again; 'cnpgen validate' and 'cnpgen validate --deep' work without it"
+        ) from error
+
+
+def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
+    """Return whether all bits are the same, and what differs by more than arithmetic on another machine can explain."""
+    same = all(np.array_equal(stored[name], values) for name, values in again.items())
+    for name, values in again.items():
+        allowed = {"f": PORTABLE, "i": 0}[values.dtype.kind] if values.dtype != np.float32 else PORTABLE_FLOAT32
+        off = np.abs(stored[name].astype(float) - values.astype(float))
+        if not (off <= allowed).all():
+            return same, f"{name} differs by {off.max():.3g}"
+    return same, ""
+
+
+def _explanation(plan: DatasetPlan, recipe: DatasetRecipe) -> str:
+    """Name the libraries and plug-ins that are not those that made the dataset."""
+    now = versions()
+    other = [f"{name} {was} -> {now.get(name)}" for name, was in plan.versions.items() if now.get(name) != was]
+    if plan.revision != REVISION:
+        other.append(f"revision of the generator {plan.revision} -> {REVISION}")
+    if recipe_digest(recipe) != plan.recipe_sha256:  # the plan's own recipe, so that only code can be different
+        other.append("the code of its plug-ins has changed")
+    return f" (made with other versions: {', '.join(other)})" if other else ""
