@@ -18,7 +18,7 @@ from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.engine import prepare, refine_part
 from cnpgen.refine.journal import Journal, open_journal
-from cnpgen.refine.options import DEFAULT, Options
+from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.threads import one_thread
 from cnpgen.workers import share_out, worker_count
@@ -74,7 +74,7 @@ class Refinement:
 def refine_plans(
     plans: Plans,
     *,
-    options: Options = DEFAULT,
+    options: RefineOptions = DEFAULT,
     workers: int | None = None,
     journal: str | Path | None = None,
     begin: Callable[[int, int], None] | None = None,
@@ -115,7 +115,7 @@ def refine_plans(
 
 
 def _run(
-    plans: Plans, waiting: list[int], options: Options, workers: int | None, journal: Journal | None
+    plans: Plans, waiting: list[int], options: RefineOptions, workers: int | None, journal: Journal | None
 ) -> Iterator[dict[int, Refined]]:
     if not waiting:
         return
@@ -131,7 +131,7 @@ def _run(
             yield dict(zip(part, refined, strict=True))
 
 
-def _refine(task: tuple[list[int], Plans], *, options: Options) -> tuple[list[int], list[Refined]]:
+def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[list[int], list[Refined]]:
     part, plans = task
     with one_thread():
         return part, refine_part(plans, options)
@@ -165,7 +165,7 @@ def _counted(words: Iterator[str]) -> dict[str, int]:
     return {str(word): count for word, count in Counter(words).most_common()}
 
 
-def _identity(plans: Plans, options: Options) -> str:
+def _identity(plans: Plans, options: RefineOptions) -> str:
     """Say what distinguishes a run: version, options and every number of the plans."""
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
     boundary = [values for values in vars(plans.boundary).values() if values is not None]

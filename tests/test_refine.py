@@ -12,7 +12,7 @@ from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.grid import make_grid
-from cnpgen.refine.options import Options
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.sqp import Bounds, Settings, minimise
@@ -140,11 +140,11 @@ def test_objectives_are_chosen_by_name_and_nonsense_is_refused() -> None:
     assert choose_criterion(PROBLEMS["heavy-object"]) is None
     assert choose_criterion(problem, "jerk", 0.2) == Criterion("jerk", 0.2)
     with pytest.raises(UsageError, match=r"objective 'tiem' .*did you mean 'time'"):
-        Options(objective="tiem")
+        RefineOptions(objective="tiem")
     with pytest.raises(UsageError, match="weight of an objective"):
-        Options(objective="effort", weight=-1.0)
+        RefineOptions(objective="effort", weight=-1.0)
     with pytest.raises(UsageError, match="tolerance must be between 0 and 1, got 0"):
-        Options(tolerance=0)
+        RefineOptions(tolerance=0)
 
 
 @pytest.mark.parametrize("label", LABELS)

@@ -18,7 +18,7 @@ from cnpgen.evaluation import evaluate_plans
 from cnpgen.make import make_dataset
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.refine.options import Options
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refinement import PART, refine_plans
 from cnpgen.solving import draw_problems, load_problems
 
@@ -82,13 +82,13 @@ def test_an_interrupted_run_goes_on_where_it_was(problems: Plans, solved: Plans,
     assert begun == [(N, PART)]
     assert same(found.plans, solved)
     refine_plans(
-        problems, workers=1, journal=journal, options=Options(tolerance=1e-3), begin=lambda *n: begun.append(n)
+        problems, workers=1, journal=journal, options=RefineOptions(tolerance=1e-3), begin=lambda *n: begun.append(n)
     )
     assert begun[-1] == (N, 0), "other options are another run"
 
 
 def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
-    found = refine_plans(solved, options=Options(max_iterations=0))
+    found = refine_plans(solved, options=RefineOptions(max_iterations=0))
     assert found.valid.all()
     assert {each.iterations for each in found.refined} == {0}
 
@@ -96,7 +96,7 @@ def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
 @pytest.mark.parametrize("objective", ["effort", "jerk"])
 def test_another_objective_gets_what_it_asks_for(problems: Plans, solved: Plans, objective: str) -> None:
     few = np.arange(4)
-    found = refine_plans(problems.select(few), options=Options(objective=objective, weight=1.0)).plans
+    found = refine_plans(problems.select(few), options=RefineOptions(objective=objective, weight=1.0)).plans
     before, after = (evaluate_plans(plans).verdicts for plans in (solved.select(few), found))
     assert all(verdict.valid for verdict in after)
     assert np.mean([getattr(v.metrics, objective) for v in after]) < np.mean(

@@ -62,11 +62,11 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
     """
     from cnpgen.cli.notices import notices
     from cnpgen.plans import save_plans
-    from cnpgen.refine.options import Options
+    from cnpgen.refine.options import RefineOptions
     from cnpgen.refinement import refine_plans
 
     names = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")
-    options = Options(**{name: getattr(arguments, name) for name in names})
+    options = RefineOptions(**{name: getattr(arguments, name) for name in names})
     journal = out.with_name(out.name + ".part")
     meter = Meter(quiet=arguments.quiet, noun="plan")
     finished = [0, 0]

@@ -11,7 +11,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.problem import ProblemRecord, open_problem
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.refine.criterion import choose_criterion
-from cnpgen.refine.options import DEFAULT, Options
+from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.sqp import Settings
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def refine_part(plans: Plans, options: Options) -> list[Refined]:
+def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
     """Refine plans, each for itself: neither the others nor their order change what comes of it.
 
     Args:
@@ -46,7 +46,7 @@ def refine_part(plans: Plans, options: Options) -> list[Refined]:
     return [refine_task(refiner, verdict, task) for task in _tasks(plans, problem)]
 
 
-def prepare(plans: Plans, options: Options) -> Refiner:
+def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     """Return the refiner for plans; kernels that are not in the cache are compiled."""
     spec = TrajectorySpec(
         degree=plans.degree,
@@ -66,13 +66,13 @@ def _tasks(plans: Plans, problem: "Problem") -> list[Task]:
 
 
 @lru_cache(maxsize=2)
-def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: Options) -> Refiner:
+def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions) -> Refiner:
     problem, robot = open_problem(record)
     return load_refiner(problem, robot, spec=spec, options=options)
 
 
 def load_refiner(
-    problem: "Problem", robot: "Robot", *, spec: TrajectorySpec | None = None, options: Options = DEFAULT
+    problem: "Problem", robot: "Robot", *, spec: TrajectorySpec | None = None, options: RefineOptions = DEFAULT
 ) -> Refiner:
     """Build the refiner of a problem with the fastest kernels that this machine can run.
 

@@ -9,7 +9,7 @@ SOLVERS = ("own", "ipopt", "sqpmethod")
 
 
 @dataclass(frozen=True)
-class Options:
+class RefineOptions:
     """How to refine.
 
     Attributes:
@@ -46,4 +46,4 @@ class Options:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
 
 
-DEFAULT = Options()
+DEFAULT = RefineOptions()
