@@ -152,6 +152,23 @@ def test_the_state_is_small_and_says_what_it_is(plain: Dataset) -> None:
     }
 
 
+def test_the_state_after_any_number_of_used_batches_needs_none_to_be_taken(plain: Dataset) -> None:
+    for drop_last in (True, False):
+        batches, ahead = plain.batches(8, epoch=1, drop_last=drop_last), plain.batches(8, drop_last=drop_last)
+        for used in range(len(batches)):
+            assert ahead.state(epoch=1, batch=used) == batches.state()
+            take(batches, 1)
+        assert ahead.state(epoch=1, batch=len(batches))["row"] == batches.state()["row"] == (48 if drop_last else 50)
+        with pytest.raises(UsageError, match=r"an epoch has \d batches, 8 cannot have been used"):
+            ahead.state(batch=8)
+
+
+def test_shapes_and_types_are_known_before_the_first_batch(plain: Dataset) -> None:
+    batches = plain.batches(8, fields=ALL, dtype="float64")
+    (batch, *_) = batches
+    assert batches.signature == {name: (values.shape[1:], values.dtype) for name, values in batch.items()}
+
+
 def test_a_loop_that_was_left_goes_on_and_a_finished_one_gives_the_next_epoch(plain: Dataset) -> None:
     batches = plain.batches(10, fields=ALL)
     assert ids(take(batches, 2)) + ids(batches) == ids(plain.batches(10, fields=ALL))
@@ -297,11 +314,11 @@ def test_resuming_reads_one_window_and_no_earlier_one(plain: Dataset, monkeypatc
 def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     running, most, original = [], [], windows.pack
 
-    def counted(*arguments: Any) -> Any:
+    def counted(*arguments: Any, **options: Any) -> Any:
         running.append(threading.current_thread())
         most.append(len(running))
         try:
-            return original(*arguments)
+            return original(*arguments, **options)
         finally:
             running.pop()
 

@@ -77,3 +77,10 @@ def test_windows_of_one_epoch_are_shuffled_differently(monkeypatch: pytest.Monke
     assert not np.array_equal(found.rows_of(0), found.rows_of(1))
     dealt = {tuple(window.shards for window in Order("train", (100,) * 8, 0, epoch).windows) for epoch in range(5)}
     assert len(dealt) == 5  # the shards are dealt out anew in every epoch
+
+
+def test_a_hundred_million_rows_need_no_stored_permutation() -> None:
+    found = Order("train", (65_536,) * 1_526, 0, 0)
+    assert len(found.windows) == 382  # of four shards, but for two of three
+    assert {window.rows for window in found.windows} == {3 * 65_536, 4 * 65_536}
+    assert len(found.rows_of(200)) == found.windows[200].rows

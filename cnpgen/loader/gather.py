@@ -38,7 +38,7 @@ def gather(source: Source, indices: ArrayLike, layout: Columns) -> Rows:
     rows = _checked(indices, source)
     found = {f.name: np.empty((len(rows), *tail(f)), storage_dtype(f, source.stored)) for f in layout.fields}
     for shard, places, local in _by_shard(rows, source):
-        columns = source.reader.read(source.shards[shard], layout.fields, keep=True)
+        columns = source.reader.read(source.shards[shard], layout.fields)
         for name, values in found.items():
             values[places] = columns[name][local]
     return found

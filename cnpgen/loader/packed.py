@@ -28,8 +28,14 @@ class Packed:
     integers: dict[str, NDArray[Any]]
 
 
-def pack(shards: Sequence[Shard], form: Form, reader: ShardReader) -> Packed:
+def pack(shards: Sequence[Shard], form: Form, reader: ShardReader, *, memory: NDArray[Any] | None = None) -> Packed:
     """Read shards whole.
+
+    Args:
+        shards: The shards.
+        form: What is wanted of their rows.
+        reader: Reads them.
+        memory: A table of the form's width and type with at least as many rows, to be used instead of a new one.
 
     Raises:
         DatasetError: A shard is missing or damaged, or the normalisation lacks a field.
@@ -37,7 +43,7 @@ def pack(shards: Sequence[Shard], form: Form, reader: ShardReader) -> Packed:
     """
     rows = sum(shard.rows for shard in shards)
     layout = form.layout
-    table = np.empty((rows, layout.width), form.dtype)
+    table = np.empty((rows, layout.width), form.dtype) if memory is None else memory[:rows]
     integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in layout.integers}
     scaling = None if form.normalization is None else form.normalization.side_by_side(layout.floats)
     first = 0

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError
 from cnpgen.fields import Field
 from cnpgen.loader.columns import tail
-from cnpgen.store.files import file_sha256, machine_error
+from cnpgen.store.files import file_sha256
 from cnpgen.store.shard import Placement, read_attributes, read_placements, read_shard
 
-MOST_MAPS = 32  # that random access keeps; each holds a file descriptor
+MOST_MAPS = 32  # that are kept; each holds a file descriptor, and pages that the system may take back at any time
 AGAIN = "run the same make-dataset command again"
 
 
@@ -50,7 +50,7 @@ class Shard:
 class ShardReader:
     """Reads fields of shards; every shard is checked once, when it is first read.
 
-    Holds no open files but a few memory maps for random access. It may be used by several threads, pickled (without its
+    Holds no open files but the memory maps of the last shards. It may be used by several threads, pickled (without its
     maps) and forked.
 
     Args:
@@ -65,13 +65,12 @@ class ShardReader:
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_maps": {}}
 
-    def read(self, shard: Shard, fields: Sequence[Field], *, keep: bool = False) -> dict[str, NDArray[Any]]:
+    def read(self, shard: Shard, fields: Sequence[Field]) -> dict[str, NDArray[Any]]:
         """Give whole fields of a shard.
 
         Args:
             shard: The shard.
             fields: The fields.
-            keep: Keep the shard mapped for the next time.
 
         Returns:
             Field name -> values as stored, shape (rows, width) or (rows,), not writeable where mapped.
@@ -80,20 +79,20 @@ class ShardReader:
             DatasetError: The shard is missing, damaged, of another plan or lacks a field.
             MachineError: The system would not let us read it.
         """
+        if problem := shard.problem():  # to touch a map that reaches beyond its file would end the process
+            raise DatasetError(f"{problem}; {AGAIN}")
         placements = self._placements.get(shard.path) or self._check(shard)
         for field in fields:
             _check_field(shard, field, placements.get(field.name))
         places = {field.name: placements[field.name] for field in fields}
         mapped = None
         if all(place.offset is not None and place.dtype.isnative for place in places.values()):
-            mapped = self._map(shard, keep=keep)
+            mapped = self._map(shard)
         if mapped is None:
             return read_shard(shard.path, list(places))
         return {name: np.ndarray(p.shape, p.dtype, mapped, p.offset or 0) for name, p in places.items()}
 
     def _check(self, shard: Shard) -> dict[str, Placement]:
-        if problem := shard.problem():
-            raise DatasetError(f"{problem}; {AGAIN}")
         if self._verify and file_sha256(shard.path) != shard.sha256:
             raise DatasetError(f"{shard.path} is damaged: its sha256 is not the recorded one; {AGAIN}")
         found = read_attributes(shard.path, ["plan_key", "first_sample_id", "rows"])  # texts may hang HDF5: see there
@@ -102,12 +101,12 @@ class ShardReader:
         self._placements[shard.path] = placements = read_placements(shard.path)
         return placements
 
-    def _map(self, shard: Shard, *, keep: bool) -> mmap.mmap | None:
+    def _map(self, shard: Shard) -> mmap.mmap | None:
         """Map a shard into memory; None where the file system cannot."""
         if (kept := self._maps.get(shard.path)) is not None:
             return kept
         mapped = _mapped(shard)
-        if keep and mapped is not None:
+        if mapped is not None:
             for oldest in list(self._maps)[: len(self._maps) - MOST_MAPS + 1]:
                 self._maps.pop(oldest, None)  # stays mapped for as long as arrays of it are in use
             self._maps[shard.path] = mapped
@@ -117,14 +116,9 @@ class ShardReader:
 def _mapped(shard: Shard) -> mmap.mmap | None:
     try:
         with shard.path.open("rb") as file:
-            if file.seek(0, 2) != shard.size:  # a map that reaches beyond the file would end the process
-                raise DatasetError(f"{shard.path} was changed while it was in use")
-            try:
-                return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            except (OSError, ValueError):
-                return None
-    except OSError as error:
-        raise machine_error("read", shard.path, error) from error
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError):  # reading it in the ordinary way works, or says why not
+        return None
 
 
 def _check_field(shard: Shard, field: Field, found: Placement | None) -> None:

@@ -4,6 +4,7 @@ import os
 from bisect import bisect_right
 from collections.abc import Iterator
 from concurrent.futures import Future
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ class Windows:
         self._source, self._form, self._order = source, form, order
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
+        self._memory: dict[int, NDArray[Any]] = {}  # of two tables, used in turn: fresh memory costs as much as packing
         self._process = os.getpid()
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:
@@ -62,7 +64,7 @@ class Windows:
     def _load(self, index: int) -> Loaded:
         """Wait for a window, start on the one after it, forget those before it."""
         if self._process != os.getpid():  # a fork has no threads: what was being loaded would never be there
-            self._process, self._futures = os.getpid(), {}
+            self._process, self._futures, self._memory = os.getpid(), {}, {}
         self._futures = {other: future for other, future in self._futures.items() if other >= index}
         loaded = self._start(index).result()
         if index + 1 < len(self._firsts):
@@ -76,4 +78,8 @@ class Windows:
 
     def _pack(self, index: int) -> Loaded:
         shards = [self._source.shards[shard] for shard in self._order.windows[index].shards]
-        return pack(shards, self._form, self._source.reader), self._order.rows_of(index)
+        if index % 2 not in self._memory:
+            most = max(window.rows for window in self._order.windows)
+            self._memory[index % 2] = np.empty((most, self._form.layout.width), self._form.dtype)
+        packed = pack(shards, self._form, self._source.reader, memory=self._memory[index % 2])
+        return packed, self._order.rows_of(index)
