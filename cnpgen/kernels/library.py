@@ -28,7 +28,6 @@ from cnpgen.recipes import Problem, resolved
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 SLOWER = "10 to 20 times slower than compiled code"  # benchmarks/generator.py measures it: 9 to 24
-REMEDY = "install gcc or clang ('cnpgen doctor' checks it)"
 
 
 @dataclass
@@ -196,8 +195,7 @@ def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     except MachineError as error:
         if wanted == "compiled":
             raise
-        text = f"{error}: running on the NumPy backend, {SLOWER}; {REMEDY}"
-        warnings.warn(text, RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{error}; running on the NumPy backend, {SLOWER}", RuntimeWarning, stacklevel=2)
         return "numpy", folder
     return "compiled", folder
 
