@@ -18,11 +18,20 @@ if TYPE_CHECKING:
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.plan_loss import PlanLoss
     from cnpgen.make import make_dataset
+    from cnpgen.planner.model_file import load_model
+    from cnpgen.planner.planner import Planner
     from cnpgen.plans.load import load_plans
     from cnpgen.plans.plans import Plans, make_plans
     from cnpgen.plans.save import save_plans
+    from cnpgen.refine.options import RefineOptions
+    from cnpgen.refinement import Refinement, refine_plans
+    from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.reader import open_dataset
+    from cnpgen.training.settings import TrainingSettings
+    from cnpgen.training.train import train_model
     from cnpgen.trajectory.boundary import Boundary
+    from cnpgen.trajectory.fit import fit_motion
+    from cnpgen.trajectory.motion import Motion
     from cnpgen.validation import validate_dataset
 
 _HOME = {
@@ -31,24 +40,35 @@ _HOME = {
     "DatasetError": "errors",
     "Evaluation": "evaluation",
     "MachineError": "errors",
+    "Motion": "trajectory.motion",
     "PlanLoss": "losses.plan_loss",
+    "Planner": "planner.planner",
     "Plans": "plans.plans",
     "RecipeError": "errors",
+    "RefineOptions": "refine.options",
+    "Refinement": "refinement",
+    "TrainingSettings": "training.settings",
     "UsageError": "errors",
     "check_machine": "doctor",
+    "draw_problems": "solving",
     "evaluate_plans": "evaluation",
     "export_plans": "export.plans",
+    "fit_motion": "trajectory.fit",
     "inspect_dataset": "inspection",
     "list_recipes": "library",
     "load_dataset": "loader.load",
     "load_dataset_recipe": "library",
+    "load_model": "planner.model_file",
     "load_pipeline": "library",
     "load_plans": "plans.load",
     "load_problem": "library",
+    "load_problems": "solving",
     "make_dataset": "make",
     "make_plans": "plans.plans",
     "open_dataset": "store.reader",
+    "refine_plans": "refinement",
     "save_plans": "plans.save",
+    "train_model": "training.train",
     "validate_dataset": "validation",
 }
 
@@ -58,25 +78,36 @@ __all__ = [
     "DatasetError",
     "Evaluation",
     "MachineError",
+    "Motion",
     "PlanLoss",
+    "Planner",
     "Plans",
     "RecipeError",
+    "RefineOptions",
+    "Refinement",
+    "TrainingSettings",
     "UsageError",
     "__version__",
     "check_machine",
+    "draw_problems",
     "evaluate_plans",
     "export_plans",
+    "fit_motion",
     "inspect_dataset",
     "list_recipes",
     "load_dataset",
     "load_dataset_recipe",
+    "load_model",
     "load_pipeline",
     "load_plans",
     "load_problem",
+    "load_problems",
     "make_dataset",
     "make_plans",
     "open_dataset",
+    "refine_plans",
     "save_plans",
+    "train_model",
     "validate_dataset",
 ]
 

@@ -24,11 +24,12 @@ LAYERS = (
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
     ("interop", "certification"),
-    ("network", "planner", "training"),
+    ("network", "planner"),
     ("make_shard", "make_plan", "make"),
     ("consistency", "shard_checks", "deep_check", "regeneration"),
     ("validation", "inspection", "describe", "plots", "doctor"),
     ("evaluation", "refinement", "solving"),
+    ("training",),
     ("cli", "__main__", "__init__"),
 )
 # What a part must not import although a layer above it may be older: the judges share no code with what they judge.

@@ -18,9 +18,11 @@ from cnpgen.cli import (
     inspect_command,
     list_command,
     make_command,
+    plan_command,
     refine_command,
     show_command,
     solve_command,
+    train_command,
     validate_command,
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
@@ -34,6 +36,8 @@ _COMMANDS = (
     show_command,
     inspect_command,
     validate_command,
+    train_command,
+    plan_command,
     solve_command,
     refine_command,
     evaluate_command,
@@ -49,6 +53,8 @@ examples:
   cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
   cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
   cnpgen validate airhockey-hit-v1 --deep            prove them with Pinocchio and Coal
+  cnpgen train airhockey-hit-v1 -o hits.h5           train a planner: two minutes
+  cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge plans with them

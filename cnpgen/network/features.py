@@ -1,0 +1,76 @@
+"""The network's inputs: start and goal states and what follows from them, standardised as in the training rows."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.network.tasks import Tasks
+
+Array = NDArray[Any]
+
+STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+BLOCKS = (*STATES, "sin_cos", "tips", "expected_time")
+CONSTANT = 1e-7  # a feature whose standard deviation is below this, in SI units, says nothing
+
+
+@dataclass(frozen=True)
+class Features:
+    """Standardised features.
+
+    Attributes:
+        blocks: Which of ``BLOCKS``, in order.
+        mean: Mean of every feature over the training rows, shape (F,).
+        scale: One over its standard deviation; 0 where it was constant, shape (F,).
+    """
+
+    blocks: tuple[str, ...]
+    mean: Array
+    scale: Array
+
+    def of(self, tasks: Tasks, dtype: str = "float32") -> Array:
+        """Compute the features of N tasks, shape (N, F)."""
+        raw = raw_features(tasks, self.blocks)
+        return ((raw - self.mean) * self.scale).astype(dtype)
+
+
+def fit_features(tasks: Tasks, blocks: tuple[str, ...] = BLOCKS) -> Features:
+    """Measure mean and standard deviation of every feature on the training rows."""
+    raw = raw_features(tasks, blocks)
+    mean, deviation = raw.mean(axis=0), raw.std(axis=0)
+    constant = deviation < CONSTANT
+    return Features(blocks, mean, np.where(constant, 0.0, 1 / np.where(constant, 1.0, deviation)))
+
+
+def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
+    """Compute features in their own units.
+
+    * ``start_q`` to ``goal_dq``: the states [rad, rad/s, rad/s^2];
+    * ``sin_cos``: sines and cosines of start and goal positions, whose products forward kinematics is made of;
+    * ``tips``: tip positions at start and goal [m];
+    * ``expected_time``: its logarithm.
+
+    Args:
+        tasks: The tasks.
+        blocks: Which of them.
+
+    Returns:
+        float64, shape (N, F).
+    """
+    return np.concatenate([_block(tasks, name) for name in blocks], axis=1, dtype=np.float64)
+
+
+def _block(tasks: Tasks, name: str) -> Array:
+    boundary = tasks.boundary
+    if name in STATES:
+        states: Array = getattr(boundary, name)
+        return states
+    if name == "sin_cos":
+        angles = np.concatenate([boundary.start_q, boundary.goal_q], axis=1)
+        return np.concatenate([np.sin(angles), np.cos(angles)], axis=1)
+    if name == "tips":
+        return np.concatenate([tasks.start_xyz, tasks.goal_xyz], axis=1)
+    if name == "expected_time":
+        return np.log(tasks.expected_time)[:, None]
+    raise ValueError(f"no block of features is called {name!r}: expected one of {', '.join(BLOCKS)}")

@@ -1,0 +1,93 @@
+"""The paper's Omega block: control points from what the network gives, and its gradient from theirs.
+
+``C_{3+i} = line_i + correction_i + scale phi_i`` with the line from C_2 to C_{C-N_d}, and ``rate = e^o / T_expected``.
+The boundary control points follow from the rates, so that boundary conditions hold by construction, and so does the
+line that hangs on two of them: gradients of the path reach the rates on both ways.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.network.tasks import Tasks
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.boundary import goal_points, start_points
+from cnpgen.trajectory.slopes import boundary_slopes
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """Control points of N motions.
+
+    Attributes:
+        path: Of p [rad], shape (N, C, n).
+        rate: Of r [1/s], shape (N, R).
+    """
+
+    path: Array
+    rate: Array
+
+
+def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec) -> ControlPoints:
+    """Compute control points; in the type of the arguments, so in float64 where they are.
+
+    Args:
+        tasks: N tasks.
+        phi: Output of the configuration head, in (-1, 1), shape (N, m n).
+        log_rate: Output of the time head, shape (N, R).
+        scale: What phi is a multiple of [rad] (the paper's pi).
+        spec: Degree and numbers of control points.
+    """
+    boundary = tasks.boundary
+    rate = np.exp(log_rate)
+    rate /= tasks.expected_time[:, None]
+    first, last = start_points(boundary, rate, spec), goal_points(boundary, rate, spec)
+    interior = (scale * phi).reshape(len(phi), -1, boundary.start_q.shape[1])
+    along = _along(interior.shape[1], interior.dtype)
+    interior += first[:, 2:3] * (1 - along) + last[:, :1] * along
+    if tasks.correction is not None:
+        interior += tasks.correction
+    return ControlPoints(np.concatenate([first, interior, last], axis=1), rate)
+
+
+def pull_back(
+    tasks: Tasks,
+    points: ControlPoints,
+    *,
+    path_gradient: Array,
+    rate_gradient: Array,
+    scale: float,
+    spec: TrajectorySpec,
+) -> tuple[Array, Array]:
+    """Turn gradients with respect to the control points into those with respect to the network's outputs.
+
+    Args:
+        tasks: N tasks.
+        points: What ``control_points`` gave.
+        path_gradient: Gradient with respect to ``points.path``, shape (N, C, n).
+        rate_gradient: Likewise to ``points.rate``, shape (N, R).
+        scale: As in ``control_points``.
+        spec: Degree and numbers of control points.
+
+    Returns:
+        Gradients with respect to phi, shape (N, m n), and to the logarithms of the rates, shape (N, R).
+    """
+    interior = path_gradient[:, 3 : spec.path_control_points - tasks.boundary.fixed_at_goal]
+    along = _along(interior.shape[1], interior.dtype)[:, 0]
+    total = path_gradient.copy()
+    total[:, 2] += (1 - along) @ interior
+    total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += along @ interior
+    rates = rate_gradient.copy()
+    for each in boundary_slopes(tasks.boundary, points.rate, spec):
+        rates[:, each.variable] += np.einsum("ij,ij->i", total[:, each.point], each.slope)
+    rates *= points.rate
+    return scale * interior.reshape(len(interior), -1), rates
+
+
+def _along(count: int, dtype: np.dtype[Any]) -> Array:
+    """How far along the line from C_2 to C_{C-N_d} the interior control points are, shape (m, 1)."""
+    return np.linspace(0, 1, count, dtype=dtype)[:, None]

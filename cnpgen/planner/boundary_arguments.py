@@ -1,0 +1,64 @@
+"""Boundary conditions as callers write them: one motion or many, rest left out."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+
+def boundary_of(  # noqa: PLR0917 - in the order of the paper
+    n: int,
+    start_q: ArrayLike,
+    start_dq: ArrayLike | None,
+    start_ddq: ArrayLike | None,
+    goal_q: ArrayLike,
+    goal_dq: ArrayLike | None,
+) -> Boundary:
+    """Check boundary conditions and bring them to shape (N, n).
+
+    Args:
+        n: Number of planned joints.
+        start_q: Shape (n,) or (N, n).
+        start_dq: Likewise, or None for zero.
+        start_ddq: Likewise, or None for zero.
+        goal_q: Likewise.
+        goal_dq: Likewise, or None for zero.
+
+    Raises:
+        UsageError: A shape is wrong, or something is not finite.
+    """
+    given = {
+        "start_q": start_q,
+        "start_dq": start_dq,
+        "start_ddq": start_ddq,
+        "goal_q": goal_q,
+        "goal_dq": goal_dq,
+    }
+    arrays = {name: _rows(name, values, n) for name, values in given.items() if values is not None}
+    rows = max(len(values) for values in arrays.values())
+    for name, values in arrays.items():
+        if len(values) not in {1, rows}:
+            raise UsageError(f"{name} has {len(values)} rows, another boundary condition has {rows}")
+    zero = np.zeros((1, n))
+    return Boundary(*(_repeated(arrays.get(name, zero), rows) for name in given))
+
+
+def _rows(name: str, values: ArrayLike, n: int) -> Array:
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name} must be an array of numbers: {error}") from error
+    if array.ndim not in {1, 2} or array.shape[-1] != n:
+        raise UsageError(f"{name} must have shape ({n},) or (N, {n}), got {array.shape}")
+    rows = array.reshape(-1, n)
+    if not np.isfinite(rows).all():
+        row = int(np.argmin(np.isfinite(rows).all(axis=1)))
+        raise UsageError(f"{name} must be finite, got {rows[row]} in row {row}")
+    return rows
+
+
+def _repeated(rows: Array, count: int) -> Array:
+    return rows if len(rows) == count else np.repeat(rows, count, axis=0)

@@ -1,0 +1,118 @@
+"""What surrounds the network: preparing tasks before it, slowing motions down behind it. Made once per problem."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.planner.model import Model
+from cnpgen.planner.preparation import Preparation, prepare_tasks
+from cnpgen.planner.slowing import Slowing, make_slowing
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.problem import ProblemRecord
+from cnpgen.plans.status import PlanStatus
+from cnpgen.recipes import Problem
+from cnpgen.robots.robot import load_robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """A problem that has been loaded from its record.
+
+    Attributes:
+        record: The problem as text.
+        problem: The problem; its URDF file exists only inside ``surroundings``.
+        robot: Its robot.
+        kernels: Where kernels are loaded from.
+    """
+
+    record: ProblemRecord
+    problem: Problem
+    robot: "Robot"
+    kernels: KernelLibrary
+
+
+@contextmanager
+def surroundings(record: ProblemRecord, backend: str | None = None) -> Iterator[Surroundings]:
+    """Load a problem from its record, for as long as the block lasts.
+
+    Args:
+        record: The problem as text.
+        backend: Which kernels to run; by default the fastest that works.
+
+    Raises:
+        CnpgenError: The record does not fit this cnpgen, or the machine lacks what it needs.
+    """
+    chosen, folder = choose_backend(backend)
+    with record.restored() as problem:
+        robot = load_robot(problem)
+        kernels = KernelLibrary(chosen, folder, record.digest, {"robot": robot, "problem": problem})
+        yield Surroundings(record, problem, robot, kernels)
+
+
+@dataclass(frozen=True)
+class Kit:
+    """What plans are made with besides the network.
+
+    Attributes:
+        prepare: What prepares tasks.
+        slowing: What slows motions from rest to rest down; None where it must not.
+    """
+
+    prepare: Preparation
+    slowing: Slowing | None
+
+    def plan(
+        self,
+        model: Model,
+        boundary: Boundary,
+        *,
+        sample_id: NDArray[np.int64] | None = None,
+        columns: Mapping[str, Array] | None = None,
+    ) -> Plans:
+        """Plan N motions.
+
+        Args:
+            model: A model of the kit's problem.
+            boundary: Boundary conditions, shape (N, n) each, float64 and finite.
+            sample_id: Which samples these are, shape (N,); 0, 1, ... by default.
+            columns: What else is known of the tasks, as ``Plans.columns``.
+        """
+        tasks = self.prepare(boundary)
+        points = model.control_points(tasks)
+        motion = Motion(points.path, points.rate, model.problem.trajectory.degree)
+        if self.slowing is not None:
+            motion = motion.slower(self.slowing.factor(motion, self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)))
+        return Plans(
+            problem=model.problem,
+            boundary=boundary,
+            path_control_points=motion.path,
+            rate_control_points=motion.rate,
+            degree=motion.degree,
+            columns={**(columns or {}), "start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
+            status=np.full(len(boundary), PlanStatus.UNKNOWN, np.uint8),
+        )
+
+
+def make_kit(given: Surroundings, *, bending_steps: int, slow_down: bool) -> Kit:
+    """Make the kit of a problem.
+
+    Args:
+        given: The problem.
+        bending_steps: Gauss-Newton steps of the baseline.
+        slow_down: Whether motions are slowed down; only for those from rest to rest.
+    """
+    prepare = prepare_tasks(given.problem, given.robot, given.kernels, bending_steps=bending_steps)
+    return Kit(prepare, make_slowing(given.problem, given.robot, given.kernels) if slow_down else None)

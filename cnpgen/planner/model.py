@@ -1,0 +1,79 @@
+"""A trained model: the network's numbers, what its inputs and outputs mean, and where it comes from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.network.architecture import Architecture
+from cnpgen.network.features import Features
+from cnpgen.network.forward import forward
+from cnpgen.network.omega import ControlPoints, control_points
+from cnpgen.network.tasks import Tasks
+from cnpgen.plans.problem import ProblemRecord
+from cnpgen.store.documents import canonical_sha256
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meaning:
+    """What the network's outputs stand for.
+
+    Attributes:
+        path_scale: What the configuration head's output is a multiple of [rad]; pi in the paper.
+        bending_steps: Gauss-Newton steps that bend the line onto the manifold's equalities; none in the paper.
+    """
+
+    path_scale: float
+    bending_steps: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A trained model.
+
+    Attributes:
+        problem: The problem that it plans for, with its URDF.
+        architecture: The network's architecture.
+        parameters: All of its numbers, float32, shape (architecture.n_parameters,).
+        features: Its inputs.
+        meaning: Its outputs.
+        rest: Names of the boundary conditions that were zero in every training row.
+        training: How it was made: command, seed, dataset, steps, seconds, score; JSON-able.
+        log: Its training log, one JSON object per line.
+    """
+
+    problem: ProblemRecord
+    architecture: Architecture
+    parameters: NDArray[np.float32]
+    features: Features
+    meaning: Meaning
+    rest: tuple[str, ...] = ()
+    training: Mapping[str, Any] = field(default_factory=dict)
+    log: str = ""
+
+    def control_points(self, tasks: Tasks) -> ControlPoints:
+        """Plan N tasks: the network in float32, boundary control points and all sums in float64."""
+        given = forward(self.architecture, self.parameters, self.features.of(tasks))
+        return control_points(
+            tasks,
+            given.path.astype(np.float64),
+            given.log_rate.astype(np.float64),
+            scale=self.meaning.path_scale,
+            spec=self.problem.trajectory,
+        )
+
+    @property
+    def rests(self) -> bool:
+        """Whether all of its motions begin and end at rest, so that they may be slowed down."""
+        return {"start_dq", "start_ddq", "goal_dq"} <= set(self.rest)
+
+    @cached_property
+    def stages_digest(self) -> str | None:
+        """The sha256 over how its training rows were drawn; None if that is not known."""
+        stages = self.training.get("stages")
+        return None if stages is None else canonical_sha256(stages)

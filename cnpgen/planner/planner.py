@@ -1,0 +1,142 @@
+"""The planner: boundary conditions in, plans out, in a fraction of a millisecond; replanning on the fly."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.planner.boundary_arguments import boundary_of
+from cnpgen.planner.kit import make_kit, surroundings
+from cnpgen.planner.model import Model
+from cnpgen.planner.model_file import load_model
+from cnpgen.plans.plans import Plans
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+
+class Planner:
+    """Plans with a trained model.
+
+    Args:
+        model: A model, the path of a model file, or the name of a model that cnpgen ships.
+        slow_down: Whether motions from rest to rest are slowed down uniformly as far as the limits need it. It is done
+            only by models whose training rows all begin and end at rest: then it is exact.
+        backend: What computes kinematics and limits; by default the fastest that works.
+
+    Attributes:
+        model: The model.
+        robot: The robot of its problem.
+
+    Raises:
+        CnpgenError: The model cannot be read, or the machine lacks what it needs.
+    """
+
+    def __init__(self, model: Model | str | Path, *, slow_down: bool = True, backend: str | None = None) -> None:
+        self.model = model if isinstance(model, Model) else load_model(model)
+        slow_down = slow_down and self.model.rests
+        with surroundings(self.model.problem, backend) as given:
+            self.robot = given.robot
+            self._kit = make_kit(given, bending_steps=self.model.meaning.bending_steps, slow_down=slow_down)
+
+    def plan(
+        self,
+        start_q: ArrayLike,
+        start_dq: ArrayLike | None = None,
+        start_ddq: ArrayLike | None = None,
+        *,
+        goal_q: ArrayLike,
+        goal_dq: ArrayLike | None = None,
+    ) -> Plans:
+        """Plan motions; boundary conditions hold to rounding, whatever the network gives.
+
+        Args:
+            start_q: Start positions [rad], shape (n,) for one motion or (N, n).
+            start_dq: Start velocities [rad/s]; at rest by default.
+            start_ddq: Start accelerations [rad/s^2]; none by default.
+            goal_q: Goal positions [rad].
+            goal_dq: Goal velocities [rad/s]; at rest by default.
+
+        Returns:
+            One plan or N, not checked yet (status UNKNOWN).
+
+        Raises:
+            UsageError: A shape is wrong, something is not finite, or something moves that was at rest in every row that
+                the model was trained on.
+        """
+        return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
+
+    def plan_batch(
+        self,
+        boundary: Boundary,
+        *,
+        sample_id: NDArray[np.int64] | None = None,
+        columns: Mapping[str, Array] | None = None,
+    ) -> Plans:
+        """Plan N motions.
+
+        Args:
+            boundary: Boundary conditions, shape (N, n) each, float64 and finite.
+            sample_id: Which samples of a dataset these are, shape (N,); 0, 1, ... by default.
+            columns: What else is known of the tasks, as ``Plans.columns``.
+
+        Raises:
+            UsageError: As for ``plan``.
+        """
+        if boundary.goal_ddq is not None:
+            raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
+        self._check_rest(boundary)
+        return self._kit.plan(self.model, boundary, sample_id=sample_id, columns=columns)
+
+    def replan(self, plans: Plans, time: ArrayLike, *, goal_q: ArrayLike, goal_dq: ArrayLike | None = None) -> Plans:
+        """Plan on from points on plans that are being executed: q, dq and ddq go on without a jump.
+
+        Args:
+            plans: One plan or N, by any planner of the same robot.
+            time: When the new plans take over, since the start of the old ones [s], one number or shape (N,). Planning
+                itself takes time: choose a moment that is still to come.
+            goal_q: New goal positions [rad], shape (n,) or (N, n).
+            goal_dq: New goal velocities [rad/s]; at rest by default.
+
+        Raises:
+            UsageError: A time is not within its plan, or as for ``plan``.
+        """
+        q, dq, ddq = states_at(plans, time)
+        return self.plan(q, dq, ddq, goal_q=goal_q, goal_dq=goal_dq)
+
+    def _check_rest(self, boundary: Boundary) -> None:
+        for name in self.model.rest:
+            moving = np.abs(getattr(boundary, name)).max(axis=1, initial=0.0)
+            if np.any(moving > 0):
+                row = int(moving.argmax())
+                raise UsageError(
+                    f"{name} was zero in every row that the model was trained on, got {moving[row]:g} in plan {row}:"
+                    " train on such rows, or use a model that was"
+                )
+
+
+def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
+    """Evaluate each of N plans at one moment.
+
+    Args:
+        plans: N plans.
+        time: Since their start [s], one number or shape (N,).
+
+    Returns:
+        Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
+
+    Raises:
+        UsageError: A time is not within its plan.
+    """
+    times = np.broadcast_to(np.asarray(time, np.float64), (len(plans),))
+    outside = ~((times >= 0) & (times <= plans.duration))
+    if outside.any():
+        row = int(outside.argmax())
+        raise UsageError(
+            f"plan {row} lasts from 0 to {plans.duration[row]:.6g} s, it cannot be evaluated at {times[row]:.6g} s"
+        )
+    motion = plans.motion
+    states = motion.at(motion.phase_at(times[:, None]))
+    return states.q[:, 0], states.dq[:, 0], states.ddq[:, 0]

@@ -1,0 +1,70 @@
+"""From boundary conditions to tasks: tip positions, obstacles, expected time, baseline; for training and planning."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.network.tasks import Tasks, expected_time
+from cnpgen.planner.baseline import Baseline, make_baseline
+from cnpgen.planner.expressions import count_equalities, equality_residuals, tip_position
+from cnpgen.recipes import Problem
+from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.trajectory.boundary import Boundary
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Prepares tasks of one problem; made by ``prepare_tasks``.
+
+    Attributes:
+        problem: The problem.
+        velocity_limit: Planning limits [rad/s], shape (n,).
+        tip: Kernel of ``expressions.tip_position``.
+        baseline: What bends the line onto the manifold; None where it stays straight.
+    """
+
+    problem: Problem
+    velocity_limit: Array
+    tip: Kernel
+    baseline: Baseline | None
+
+    def __call__(self, boundary: Boundary) -> Tasks:
+        """Prepare N tasks, in float64."""
+        ends = np.concatenate([boundary.start_q, boundary.goal_q])
+        (tips,) = self.tip(np.ascontiguousarray(ends.T))
+        start_xyz, goal_xyz = tips[:, : len(boundary)].T, tips[:, len(boundary) :].T
+        time = expected_time(boundary, self.velocity_limit)
+        correction = None
+        if self.baseline is not None:
+            correction = self.baseline.correction(boundary, 1 / time, self.tops(start_xyz, goal_xyz))
+        return Tasks(boundary, start_xyz, goal_xyz, time, correction)
+
+    def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
+        """Heights of the obstacles' upper faces [m], shape (N, obstacles)."""
+        return obstacle_tops(self.problem, start_xyz, goal_xyz)
+
+
+def prepare_tasks(problem: Problem, robot: "Robot", kernels: KernelLibrary, *, bending_steps: int) -> Preparation:
+    """Load what tasks are prepared with.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Where kernels are loaded from.
+        bending_steps: Gauss-Newton steps of the baseline; 0 leaves it straight.
+    """
+    equalities = count_equalities(robot, problem) if bending_steps else 0
+    baseline = None
+    if equalities:
+        residuals = kernels.load(equality_residuals)
+        baseline = make_baseline(residuals, equalities, problem.trajectory, steps=bending_steps)
+    return Preparation(problem, robot.velocity_limit, kernels.load(tip_position), baseline)

@@ -1,0 +1,110 @@
+"""HDF5 files under a seal: the first 512 bytes say what the file is and the sha256 of all that follows.
+
+Any HDF5 reader opens them (the format leaves the first block to the user); cnpgen checks the seal before the HDF5
+library sees a byte, because that library can hang on a damaged file.
+"""
+
+import hashlib
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.files import read_file, write_file
+
+BLOCK = 512  # bytes of the seal
+_SEAL = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a sealed file holds.
+
+    Attributes:
+        arrays: Dataset name -> numbers.
+        texts: Dataset name -> text, stored as UTF-8 bytes.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    texts: Mapping[str, str]
+
+
+def write_sealed(path: Path, content: Content, *, kind: str, version: int) -> None:
+    """Write a sealed file atomically; equal content gives equal bytes.
+
+    Args:
+        path: Where to; a file that is there is replaced.
+        content: What to write.
+        kind: What the file is: ``cnpgen-`` and one word.
+        version: Version of its format.
+
+    Raises:
+        MachineError: The disk is full, read-only or otherwise unwilling.
+    """
+    write_file(path, seal(content, kind=kind, version=version))
+
+
+def seal(content: Content, *, kind: str, version: int) -> bytes:
+    """Return the bytes of a sealed file."""
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(_create(buffer)) as file:
+        for name, values in content.arrays.items():
+            file.create_dataset(name, data=values, track_times=False)
+        for name, text in content.texts.items():
+            file.create_dataset(name, data=np.frombuffer(text.encode(), np.uint8), track_times=False)
+    body = buffer.getvalue()[BLOCK:]
+    head = f"{kind} {version}\nsha256 {hashlib.sha256(body).hexdigest()}\n"
+    return head.encode().ljust(BLOCK, b"\0") + body
+
+
+def read_sealed(path: Path, *, kind: str, version: int) -> Content:
+    """Read a sealed file.
+
+    Args:
+        path: The file.
+        kind: What it must be.
+        version: The newest version of its format that the caller understands.
+
+    Raises:
+        DatasetError: It is missing, of another kind, cut off, damaged, or from a newer cnpgen.
+        MachineError: The system would not let us read it.
+    """
+    import h5py
+
+    data = read_file(path)
+    head = _SEAL.match(data[:BLOCK])
+    what = kind.removeprefix("cnpgen-")
+    if head is None:
+        raise DatasetError(f"{path} is not a {what} of cnpgen, or its beginning is damaged")
+    if head[1].decode() != kind:
+        raise DatasetError(f"{path} is a {head[1].decode().removeprefix('cnpgen-')} of cnpgen, not a {what}")
+    if int(head[2]) > version:
+        raise DatasetError(
+            f"{path} has format version {int(head[2])}, this cnpgen reads up to {version}: upgrade cnpgen"
+        )
+    if hashlib.sha256(data[BLOCK:]).hexdigest().encode() != head[3]:
+        raise DatasetError(f"{path} is damaged or cut off: its sha256 is not the one it was written with")
+    with h5py.File(io.BytesIO(data), "r") as file:
+        values = {name: item[()] for name, item in file.items()}
+    texts = {name: value.tobytes().decode() for name, value in values.items() if value.dtype == np.uint8}
+    return Content({name: value for name, value in values.items() if name not in texts}, texts)
+
+
+def _create(buffer: io.BytesIO) -> Any:
+    """Create an HDF5 file in ``buffer`` that leaves the first block free and stores no times."""
+    from h5py import h5f, h5fd, h5p
+
+    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
+    creation.set_userblock(BLOCK)
+    creation.set_obj_track_times(False)
+    access.set_fileobj_driver(h5fd.fileobj_driver, buffer)
+    access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
+    return h5f.create(b"sealed", h5f.ACC_TRUNC, creation, access)

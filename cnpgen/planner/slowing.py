@@ -1,0 +1,106 @@
+"""Uniform slow-down: motions from rest to rest may be run slower along the same path, as far as the limits need it.
+
+At ``r / k`` velocities are 1/k and accelerations 1/k^2 of what they were. A bounded value g(q, dq, ddq) is then
+``g0 + b / k + c / k^2``, exactly so for velocities, accelerations and torques; g at k = 1, at k = 2 and at rest gives
+b and c, and the smallest k at which every g is within its bounds follows in closed form.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.expressions import speed_bounds, speed_residuals
+from cnpgen.recipes import Problem
+from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline import basis, chebyshev
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+PHASES = 128
+SLOWEST = 3.0  # no motion is slowed down more: what breaks limits by so much is no plan
+SPARE = 2e-4  # relative: between two phases a limit may be exceeded by about this much
+BLOCK = 64  # motions at once, so that arrays stay in the cache
+
+
+@dataclass(frozen=True)
+class Slowing:
+    """Finds how much slower motions of one problem must be; made by ``make_slowing``.
+
+    Attributes:
+        residuals: Kernel of ``expressions.speed_residuals``.
+        lower: Lower bounds of its values, shape (m,).
+        upper: Upper bounds, shape (m,).
+        path: Basis of p, p' and p'' at K phases, shape (3, K, C).
+        rate: Basis of r and r', shape (2, K, R).
+    """
+
+    residuals: Kernel
+    lower: Array
+    upper: Array
+    path: Array
+    rate: Array
+
+    def factor(self, motion: Motion, tops: Array) -> Array:
+        """Smallest factor, at least 1, by which each of N motions from rest to rest must be slower.
+
+        What slowing down does not help against (a torque that gravity alone exceeds) is left alone.
+
+        Args:
+            motion: N motions, with the problem's numbers of control points.
+            tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
+
+        Returns:
+            Shape (N,).
+        """
+        parts = [slice(first, first + BLOCK) for first in range(0, len(motion), BLOCK)]
+        return np.concatenate([np.empty(0), *(self._block(motion[part], tops[part]) for part in parts)])
+
+    def _block(self, motion: Motion, tops: Array) -> Array:
+        p, p1, p2 = (_lanes(table @ motion.path) for table in self.path)
+        r, r1 = ((motion.rate @ table.T).reshape(1, -1) for table in self.rate)
+        dq, ddq = p1 * r, (p2 * r + p1 * r1) * r
+        heights = np.repeat(tops.T, self.path.shape[1], axis=1)
+        fast, slow, rest = (self.residuals(p, dq / k, ddq / k**2, heights)[0] for k in (1.0, 2.0, np.inf))
+        quadratic = 2 * (fast - 2 * slow + rest)  # c, from g(1) = rest + b + c and g(2) = rest + b / 2 + c / 4
+        linear = fast - rest - quadratic
+        needed = np.maximum(
+            _smallest(self.upper[:, None] - rest, linear, quadratic),
+            _smallest(rest - self.lower[:, None], -linear, -quadratic),
+        )
+        factor: Array = needed.max(axis=0, initial=1.0).reshape(len(motion), -1).max(axis=1)
+        return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
+
+
+def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Slowing:
+    """Prepare the slow-down of one problem.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Where kernels are loaded from.
+    """
+    spec, s = problem.trajectory, chebyshev(PHASES)
+    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(3)])
+    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)])
+    return Slowing(kernels.load(speed_residuals), *speed_bounds(robot, problem), path, rate)
+
+
+def _lanes(values: Array) -> Array:
+    """Turn (N, K, n) into (n, N K)."""
+    return np.ascontiguousarray(values.reshape(-1, values.shape[-1]).T)
+
+
+def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:
+    """Smallest k >= 1 with ``linear / k + quadratic / k^2 <= room``, elementwise; 1 where there is no room at rest."""
+    with np.errstate(all="ignore"):
+        root = np.sqrt(np.maximum(linear**2 + 4 * quadratic * room, 0.0))
+        k = (linear + root) / (2 * room)  # of room k^2 - linear k - quadratic = 0
+    broken = (linear + quadratic > room) & (room > 0) & np.isfinite(k)
+    return np.where(broken, np.maximum(k, 1.0), 1.0)

@@ -1,0 +1,1 @@
+"""Training: from a dataset to a planner, with the loss that needs no demonstrations."""

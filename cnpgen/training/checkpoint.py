@@ -1,0 +1,80 @@
+"""Checkpoints: the state of a run and which run it is of, so that another run is not taken for this one."""
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError
+from cnpgen.planner.sealed import read_sealed, write_sealed
+from cnpgen.training.state import State, from_content, to_content
+
+KIND, VERSION = "cnpgen-checkpoint", 1
+EVERY, LATEST = 20.0, 50.0  # s of wall time between two checkpoints, and where writing one takes long
+SHARE = 20.0  # so many times longer than writing one takes
+
+
+class Checkpoints:
+    """Writes checkpoints of one run, now and then.
+
+    Args:
+        path: The file.
+        identity: What the run is: settings, dataset, steps; JSON-able.
+    """
+
+    def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
+        self.path, self._identity = path, json.dumps(identity, sort_keys=True)
+        self._next = time.monotonic() + EVERY
+
+    def load(self) -> State | None:
+        """Return the state that the run was left in; None if it has none.
+
+        Raises:
+            DatasetError: The file is damaged, or of another run.
+        """
+        if not self.path.exists():
+            return None
+        content = read_sealed(self.path, kind=KIND, version=VERSION)
+        try:
+            found, mine = json.loads(content.texts["identity"]), json.loads(self._identity)
+            state = from_content(content)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
+        changed = list(_differences(found, mine))
+        if changed:
+            raise DatasetError(
+                f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to go"
+                " on with it, or --force to begin again"
+            )
+        return state
+
+    def save_now_and_then(self, state: State) -> None:
+        """Save the state if the last time was long ago."""
+        if time.monotonic() > self._next:
+            self.save(state)
+
+    def save(self, state: State) -> None:
+        """Save the state.
+
+        Raises:
+            MachineError: The disk is full, read-only or otherwise unwilling.
+        """
+        begun, content = time.monotonic(), to_content(state)
+        content = replace(content, texts={**content.texts, "identity": self._identity})
+        write_sealed(self.path, content, kind=KIND, version=VERSION)
+        took = time.monotonic() - begun
+        self._next = time.monotonic() + min(max(EVERY, SHARE * took), LATEST)
+
+    def remove(self) -> None:
+        """Remove the file."""
+        self.path.unlink(missing_ok=True)
+
+
+def _differences(found: Any, mine: Any, key: str = "") -> Iterator[str]:
+    if isinstance(found, dict) and isinstance(mine, dict):
+        for name in [*found, *(name for name in mine if name not in found)]:
+            yield from _differences(found.get(name), mine.get(name), f"{key}.{name}" if key else name)
+    elif found != mine:
+        yield f"{key} ({found!r}, now {mine!r})" if len(repr(found)) + len(repr(mine)) < 80 else key

@@ -1,0 +1,88 @@
+"""The learning curve: loss, terms, validity and motion time against CPU time, as a picture."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.store.files import machine_error
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SMALLEST = 1e-12  # terms that are zero are drawn here
+
+
+def plot_curve(log: str, path: str | Path) -> None:
+    """Draw a training log.
+
+    Args:
+        log: The log, one JSON object per line.
+        path: Picture file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
+
+    Raises:
+        UsageError: The log holds no step.
+        MachineError: matplotlib is missing, or the file cannot be written.
+    """
+    records = [json.loads(line) for line in log.splitlines()]
+    steps = [record for record in records if "loss" in record]
+    if not steps:
+        raise UsageError("the log holds no step: nothing to draw")
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
+    figure = Figure(figsize=(12, 7), layout="constrained", dpi=110)
+    axes = figure.subplots(2, 2, sharex=True).ravel()
+    _draw_loss(axes[0], steps)
+    _draw_terms(axes[1], steps)
+    checks = [record for record in records if "validation" in record]
+    _draw_validity(axes[2], checks)
+    _draw_times(axes[3], checks)
+    for axis in axes[2:]:
+        axis.set_xlabel("CPU time of training [s]")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    try:
+        figure.savefig(Path(path))
+    except OSError as error:
+        raise machine_error("write", Path(path), error) from error
+
+
+def _draw_loss(axis: "Axes", steps: list[dict[str, Any]]) -> None:
+    seconds = _column(steps, "seconds")
+    axis.plot(seconds, _column(steps, "loss"), label="weighted sum")
+    axis.plot(seconds, [record["terms"]["time"] for record in steps], label="task loss alone")
+    axis.set_ylabel("loss [s]")
+    axis.set_yscale("log")
+    axis.legend()
+
+
+def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
+    """Draw every constraint term; dashed, its budget in the problem file."""
+    seconds, budgets = _column(steps, "seconds"), steps[0].get("budgets", {})
+    for name in steps[0]["weights"]:
+        (line,) = axis.plot(seconds, [max(record["terms"][name], SMALLEST) for record in steps], label=name)
+        if budgets.get(name):
+            axis.axhline(budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8)
+    axis.set_ylabel("terms (dashed: budgets)")
+    axis.set_yscale("log")
+    axis.legend(fontsize=8)
+
+
+def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
+    seconds = _column(checks, "seconds")
+    for name, label in (("valid", "strict verdict"), ("paper_valid", "the paper's rules")):
+        axis.plot(seconds, [100 * record["validation"][name] for record in checks], marker=".", label=label)
+    axis.set_ylabel("valid plans [%]")
+    axis.set_ylim(0, 101)
+    axis.legend()
+
+
+def _draw_times(axis: "Axes", checks: list[dict[str, Any]]) -> None:
+    axis.plot(_column(checks, "seconds"), [record["validation"]["duration_s"] for record in checks], marker=".")
+    axis.set_ylabel("mean motion time [s]")
+
+
+def _column(records: list[dict[str, Any]], name: str) -> list[float]:
+    return [record[name] for record in records]

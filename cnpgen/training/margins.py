@@ -1,0 +1,21 @@
+"""How much room training leaves to the bounds, by the kind of constraint."""
+
+from collections.abc import Sequence
+
+from cnpgen.losses.margins import Margins
+
+# A penalty leaves violations of the order of 1 / weight, and a network errs by a percent here and there.
+FACTORS = {"joint-position": 0.999, "joint-velocity": 0.99, "joint-acceleration": 0.985, "joint-torque": 0.97}
+INSETS = {"table": 1e-3, "object-contact": 5e-4}  # m
+
+
+def suggested_margins(terms: Sequence[str]) -> Margins:
+    """Return the margins of the terms whose kinds are known; none of others.
+
+    Args:
+        terms: ``PlanLoss.terms``.
+    """
+    return Margins(
+        {name: FACTORS[name] for name in terms if name in FACTORS},
+        {name: INSETS[name] for name in terms if name in INSETS},
+    )

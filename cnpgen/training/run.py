@@ -1,0 +1,182 @@
+"""A training run: steps, log, validation, checkpoints, and the best model at the end."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import MachineError
+from cnpgen.losses.metric import Metric
+from cnpgen.losses.quadrature import rotating_shift
+from cnpgen.network.features import Features
+from cnpgen.planner.model import Meaning, Model
+from cnpgen.plans.problem import ProblemRecord
+from cnpgen.training.checkpoint import Checkpoints
+from cnpgen.training.journal import Journal
+from cnpgen.training.order import Order
+from cnpgen.training.rows import Rows
+from cnpgen.training.schedule import learning_rate
+from cnpgen.training.state import Best, State, Sums
+from cnpgen.training.step import Learner
+
+Array = NDArray[Any]
+Watcher = Callable[[Mapping[str, Any]], None]
+Validate = Callable[[Model], Mapping[str, Any]]
+
+LINES, CHECKS = 100, 10  # of the log, and validations, in a run
+STRIDE = 7  # between the shifts of successive steps: coprime to their number, so that neighbours differ
+
+
+@dataclass
+class Run:
+    """One run.
+
+    Attributes:
+        learner: Architecture, loss, settings.
+        names: Of the loss's terms.
+        budgets: Term -> its acceptable value, from the problem file.
+        rows: The training rows.
+        features: How their features are standardised.
+        metric: Weights of the constraint terms.
+        problem: The problem.
+        validate: Judges a model: a record for the log with a ``score``, the larger the better.
+        rest: Boundary conditions that are zero in every training row.
+        training: What the model will say of how it was made.
+        order: Which rows a step trains on.
+    """
+
+    learner: Learner
+    names: tuple[str, ...]
+    budgets: Mapping[str, float]
+    rows: Rows
+    features: Features
+    metric: Metric
+    problem: ProblemRecord
+    validate: Validate
+    rest: tuple[str, ...] = ()
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        settings = self.learner.settings
+        self.order = Order(len(self.rows), settings.batch_size, settings.seed)
+
+    def go_on(self, state: State, checkpoints: Checkpoints, journal: Journal, watch: Watcher | None = None) -> None:
+        """Train until the end.
+
+        Args:
+            state: Where the run is; changed in place.
+            checkpoints: Where it is saved now and then.
+            journal: The log.
+            watch: Called with every line of the log.
+
+        Raises:
+            MachineError: The loss is not finite any more, or the disk is full.
+        """
+        gradient = np.empty_like(state.adam.parameters)
+        if state.metric:
+            self.metric.load_state(state.metric)
+        while state.adam.step < state.steps:
+            begun = time.process_time()
+            self.step(state, gradient)
+            state.seconds += time.process_time() - begun
+            for record in self._due(state):
+                journal.write(record)
+                if watch is not None:
+                    watch(record)
+            checkpoints.save_now_and_then(state)
+
+    def model(self, parameters: Array, *, log: str = "", training: Mapping[str, Any] | None = None) -> Model:
+        """Make a model of parameters.
+
+        Args:
+            parameters: Shape (n_parameters,).
+            log: The training log.
+            training: What is added to what the model says of how it was made.
+        """
+        settings = self.learner.settings
+        return Model(
+            problem=self.problem,
+            architecture=self.learner.architecture,
+            parameters=parameters.astype(np.float32),
+            features=self.features,
+            meaning=Meaning(path_scale=settings.path_scale, bending_steps=settings.bending_steps),
+            rest=self.rest,
+            training={**self.training, **(training or {})},
+            log=log,
+        )
+
+    def step(self, state: State, gradient: Array) -> None:
+        """Take one step.
+
+        Args:
+            state: Changed in place.
+            gradient: Scratch, shape (n_parameters,).
+        """
+        adam, step = state.adam, state.adam.step
+        progress = step / state.steps
+        terms = self.learner.gradient(
+            adam.parameters,
+            self.rows.take(self.order.batch(step)),
+            self.metric.weights(progress),
+            shift=rotating_shift(step * STRIDE, self.learner.settings.shifts),
+            clipping=state.clipping,
+            out=gradient,
+        )
+        self.learner.update(adam, state.clipping, gradient, rate=self._rate(state, step))
+        self.metric.observe(terms, progress)
+        if adam.step % self.order.batches == 0:
+            self.metric.end_epoch(progress)
+        state.metric = self.metric.state()
+        state.sums.add(terms)
+
+    def _rate(self, state: State, step: int) -> float:
+        chosen = self.learner.settings
+        return learning_rate(
+            step, state.steps, peak=chosen.learning_rate, final=chosen.final_rate, warm_up=chosen.warm_up
+        )
+
+    def _due(self, state: State) -> list[dict[str, Any]]:
+        """Return the records that the log gets after this step."""
+        step, records = state.adam.step, []
+        if _is_due(step, state.steps, LINES):
+            records.append(self._progress(state))
+        if _is_due(step, state.steps, CHECKS):
+            records.append(self._check(state))
+        return records
+
+    def _progress(self, state: State) -> dict[str, Any]:
+        """Say what the terms were since the last line."""
+        sums, step = state.sums, state.adam.step
+        if sums.lost > sums.steps * self.order.batch_size // 2:
+            raise MachineError(f"the loss of most plans is not finite at step {step}: try a smaller --learning-rate")
+        means = sums.terms / sums.steps
+        weights = self.metric.weights((step - 1) / state.steps)
+        state.sums = Sums(np.zeros_like(sums.terms))
+        return {
+            "step": step,
+            "epoch": round(step / self.order.batches, 3),
+            "learning_rate": self._rate(state, step - 1),
+            "seconds": round(state.seconds, 2),
+            "loss": float(means[0] + means[1:] @ weights),
+            "terms": dict(zip(self.names, means.tolist(), strict=True)),
+            "weights": dict(zip(self.names[1:], weights.tolist(), strict=True)),
+            "budgets": dict(self.budgets),
+            "lost": sums.lost,
+        }
+
+    def _check(self, state: State) -> dict[str, Any]:
+        """Validate the averaged parameters; keep them if they are the best so far."""
+        begun, step = time.process_time(), state.adam.step
+        found = self.validate(self.model(state.adam.average))
+        if found["score"] >= state.best.score:
+            state.best = Best(found["score"], step, state.adam.average.copy())
+        state.checking += time.process_time() - begun
+        return {"step": step, "seconds": round(state.seconds, 2), "validation": dict(found)}
+
+
+def _is_due(step: int, steps: int, times: int) -> bool:
+    """Whether something that happens so many times in a run happens after this step."""
+    return step * times // steps > (step - 1) * times // steps

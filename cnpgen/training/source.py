@@ -1,0 +1,69 @@
+"""Where training rows come from: a dataset on disk, its problem, its splits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError
+from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.load import load_dataset
+from cnpgen.plans.layout import BOUNDARY
+from cnpgen.store.plan import DatasetPlan
+from cnpgen.training.rows import boundary_columns
+from cnpgen.trajectory.boundary import Boundary
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset that is trained on.
+
+    Attributes:
+        dataset: The dataset.
+        train: Name of the split that is trained on.
+        validation: Name of the split that is only looked at.
+    """
+
+    dataset: Dataset
+    train: str
+    validation: str
+
+    def boundary(self, split: str, rows: int | None = None) -> Boundary:
+        """Read boundary conditions; the first rows, or all."""
+        dataset = self.dataset
+        names = [name for name in BOUNDARY if name in dataset.fields]
+        if rows is None:
+            return boundary_columns(dataset.arrays(split, fields=names, dtype="float64"))
+        count = min(rows, dataset.splits[split])
+        return boundary_columns(dataset.rows(split, list(range(count)), fields=names, dtype="float64"))
+
+    def describe(self) -> dict[str, Any]:
+        """Say which rows these are, for the model's file."""
+        plan = self.dataset.plan
+        return {
+            "name": plan.name,
+            "version": plan.version,
+            "seed": plan.seed,
+            "recipe_sha256": plan.recipe_sha256,
+            "fingerprint": self.dataset.fingerprint,
+            "rows": dict(self.dataset.splits),
+        }
+
+
+def open_source(folder: str | Path) -> Source:
+    """Open a dataset for training.
+
+    Raises:
+        DatasetError: It is missing, unfinished or damaged, or has no rows to train on or to validate with.
+    """
+    dataset = load_dataset(folder)
+    names = [name for name, rows in dataset.splits.items() if rows]
+    if len(names) < 2:
+        raise DatasetError(f"{folder} needs a split to train on and another one to validate with, it has {names}")
+    train = "train" if "train" in names else names[0]
+    others = [name for name in names if name != train]
+    return Source(dataset, train, "validation" if "validation" in others else others[0])
+
+
+def stages_of(plan: DatasetPlan) -> list[dict[str, Any]]:
+    """Return how the rows of a dataset were drawn."""
+    return list(plan.recipe["pipeline"]["stage"])

@@ -1,0 +1,134 @@
+"""Everything that a run remembers from one step to the next: all that a checkpoint needs to hold."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.planner.sealed import Content
+from cnpgen.training.adam import Adam, start_adam
+from cnpgen.training.clipping import Clipping
+
+Array = NDArray[Any]
+
+
+@dataclass
+class Sums:
+    """What was summed up since the last line of the log.
+
+    Attributes:
+        terms: Sum over steps of the terms' means, shape (1 + m,).
+        steps: Number of steps.
+        lost: Plans whose loss was not finite.
+    """
+
+    terms: Array
+    steps: int = 0
+    lost: int = 0
+
+    def add(self, terms: Array) -> None:
+        """Add the terms of a batch, shape (N, 1 + m); plans without a loss are counted and left out."""
+        good: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
+        if good.all():
+            self.terms += terms.mean(axis=0, dtype=np.float64)
+        elif good.any():
+            self.terms += terms[good].mean(axis=0, dtype=np.float64)
+        self.lost += int(len(good) - good.sum())
+        self.steps += 1
+
+
+@dataclass
+class Best:
+    """The best model so far.
+
+    Attributes:
+        score: What it is compared by, the larger the better; -inf before the first validation.
+        step: When it was validated.
+        parameters: Its parameters, shape (n_parameters,).
+    """
+
+    score: float
+    step: int
+    parameters: Array
+
+
+@dataclass
+class State:
+    """The state of a run.
+
+    Attributes:
+        adam: Parameters and moments.
+        clipping: Running sizes of gradients.
+        steps: Steps of the whole run.
+        metric: State of the metric, JSON-able.
+        sums: For the log.
+        best: The best model so far.
+        seconds: CPU time of all steps [s].
+        checking: CPU time of validation [s].
+    """
+
+    adam: Adam
+    clipping: Clipping
+    sums: Sums
+    best: Best
+    steps: int
+    metric: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    checking: float = 0.0
+
+
+def start_state(parameters: Array, *, terms: int, steps: int) -> State:
+    """Begin a run.
+
+    Args:
+        parameters: The first parameters.
+        terms: Number of the loss's terms.
+        steps: Steps of the whole run.
+    """
+    best = Best(-math.inf, 0, parameters.copy())
+    return State(start_adam(parameters), Clipping(), Sums(np.zeros(terms)), best, steps)
+
+
+def to_content(state: State) -> Content:
+    """Lay a state out as arrays and texts."""
+    adam, best = state.adam, state.best
+    arrays = {name: getattr(adam, name) for name in ("parameters", "average", "first", "second")}
+    numbers = {
+        "step": adam.step,
+        "steps": state.steps,
+        "clipping": asdict(state.clipping),
+        "metric": dict(state.metric),
+        "sums": {"steps": state.sums.steps, "lost": state.sums.lost},
+        "best": {"score": best.score, "step": best.step},
+        "seconds": state.seconds,
+        "checking": state.checking,
+    }
+    return Content(
+        {**arrays, "best": best.parameters, "terms": state.sums.terms}, {"numbers": json.dumps(numbers, indent=1)}
+    )
+
+
+def from_content(content: Content) -> State:
+    """Put a state together again.
+
+    Raises:
+        KeyError: Something is missing.
+        ValueError: Likewise.
+    """
+    numbers, arrays = json.loads(content.texts["numbers"]), content.arrays
+    names = ("parameters", "average", "first", "second")
+    best = numbers["best"]
+    return State(
+        Adam(**{name: np.array(arrays[name]) for name in names}, step=numbers["step"]),
+        Clipping(**numbers["clipping"]),
+        Sums(np.array(arrays["terms"]), **numbers["sums"]),
+        Best(best["score"], best["step"], np.array(arrays["best"])),
+        numbers["steps"],
+        numbers["metric"],
+        numbers["seconds"],
+        numbers["checking"],
+    )

@@ -1,0 +1,97 @@
+"""One step of training: batch, network, loss, gradient, parameters."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.losses.value import LossValue
+from cnpgen.network.architecture import Architecture
+from cnpgen.network.forward import backward, forward
+from cnpgen.network.omega import control_points, pull_back
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.training.adam import Adam
+from cnpgen.training.clipping import Clipping
+from cnpgen.training.rows import Rows
+from cnpgen.training.settings import TrainingSettings
+
+Array = NDArray[Any]
+
+
+Loss = Callable[..., LossValue]
+
+
+@dataclass(frozen=True)
+class Learner:
+    """What a step needs and does not change.
+
+    Attributes:
+        architecture: The network's architecture.
+        spec: Degree and numbers of control points.
+        loss: The loss.
+        settings: The settings.
+    """
+
+    architecture: Architecture
+    spec: TrajectorySpec
+    loss: Loss
+    settings: TrainingSettings
+
+    def gradient(
+        self, parameters: Array, rows: Rows, weights: Array, *, shift: float, clipping: Clipping, out: Array
+    ) -> Array:
+        """Write the gradient of the mean loss of a batch with respect to all parameters.
+
+        Args:
+            parameters: The parameters.
+            rows: The batch.
+            weights: Weight of every constraint term, shape (m,).
+            shift: Of the quadrature nodes, in [0, 1).
+            clipping: Running size of the samples' gradients.
+            out: Where to, shape (n_parameters,).
+
+        Returns:
+            The terms of every sample, shape (N, 1 + m).
+        """
+        given = forward(self.architecture, parameters, rows.features)
+        scale, spec = self.settings.path_scale, self.spec
+        points = control_points(rows.tasks, given.path, given.log_rate, scale=scale, spec=spec)
+        value = self.loss(
+            points.path,
+            points.rate,
+            weights=weights,
+            tops=rows.tops,
+            shift=shift,
+        )
+        phi, log_rate = pull_back(
+            rows.tasks,
+            points,
+            path_gradient=value.path_gradient.astype(parameters.dtype, copy=False),
+            rate_gradient=value.rate_gradient.astype(parameters.dtype, copy=False),
+            scale=scale,
+            spec=spec,
+        )
+        factors = self._factors(phi, log_rate, clipping)
+        phi *= factors
+        log_rate *= factors
+        backward(self.architecture, parameters, given, path_gradient=phi, log_rate_gradient=log_rate, out=out)
+        return value.terms
+
+    def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
+        """Return what the gradient of every sample is multiplied by, shape (N, 1); one that is not finite becomes 0."""
+        norms = np.sqrt(np.einsum("ij,ij->i", phi, phi) + np.einsum("ij,ij->i", log_rate, log_rate))
+        usable = np.isfinite(norms)
+        if not usable.all():
+            phi[~usable], log_rate[~usable] = 0, 0
+            norms = np.where(usable, norms, 0)
+        factors = clipping.sample_factors(norms, limit=self.settings.sample_clip)
+        return (factors / len(factors))[:, None]
+
+    def update(self, adam: Adam, clipping: Clipping, gradient: Array, *, rate: float) -> None:
+        """Clip the gradient of a batch and take Adam's step."""
+        norm = float(np.sqrt(np.dot(gradient, gradient)))
+        if np.isfinite(norm):
+            gradient *= clipping.batch_factor(norm, limit=self.settings.batch_clip)
+            adam.update(gradient, rate=rate, memory=self.settings.memory)

@@ -1,0 +1,60 @@
+"""How the boundary control points move with the rate: the derivatives that training and refining go back through."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline import end_derivatives
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class BoundarySlope:
+    """Derivative of one path control point with respect to one rate control point.
+
+    Attributes:
+        point: Index of the path control point, 0 to C - 1.
+        variable: Index of the rate control point, 0 to R - 1.
+        slope: d(path control point) / d(rate control point) [rad s], shape (N, n).
+    """
+
+    point: int
+    variable: int
+    slope: Array
+
+
+def boundary_slopes(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundarySlope]:
+    """Differentiate ``boundary.start_points`` and ``boundary.goal_points``; what is not listed is zero.
+
+    Args:
+        boundary: Boundary conditions of N motions.
+        rate: Rate control points [1/s], shape (N, R), positive.
+        spec: Degree and numbers of control points.
+    """
+    b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
+    c1, c2, c2_inner = _end_slopes(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)
+    slopes = [BoundarySlope(1, 0, c1), BoundarySlope(2, 0, c2), BoundarySlope(2, 1, c2_inner)]
+    goal_ddq = np.zeros_like(b.goal_q) if b.goal_ddq is None else b.goal_ddq
+    c1, c2, c2_inner = _end_slopes(-b.goal_dq, goal_ddq, rate[:, -1:], rate[:, -2:-1], spec)
+    slopes.append(BoundarySlope(points - 2, last, c1))
+    if b.goal_ddq is not None:
+        slopes += [BoundarySlope(points - 3, last, c2), BoundarySlope(points - 3, last - 1, c2_inner)]
+    return slopes
+
+
+def _end_slopes(dq: Array, ddq: Array, outer: Array, inner: Array, spec: TrajectorySpec) -> tuple[Array, Array, Array]:
+    """Return dc1/dr0, dc2/dr0 and dc2/dr1 at the end where the path has velocity dq and acceleration ddq.
+
+    With ``p' = dq / r0`` and ``p'' = ddq / r0^2 - dq eta_r (r1 - r0) / r0^2``: ``c1 = q + p' / eta`` and
+    ``c2 = p'' / beta - 2 q + 3 c1`` (paper, Appendix A).
+    """
+    path = end_derivatives(spec.path_control_points, spec.degree)
+    eta = end_derivatives(spec.rate_control_points, spec.degree).eta
+    c1 = -dq / (outer**2 * path.eta)
+    second = (-2 * (ddq - dq * eta * (inner - outer)) / outer + dq * eta) / outer**2
+    return c1, second / path.beta + 3 * c1, -dq * eta / (outer**2 * path.beta)
