@@ -13,8 +13,7 @@ from cnpgen.outcome import Outcome, merge_outcomes
 from cnpgen.pipelines.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
-from cnpgen.pipelines.stage import BLOCK_ROWS
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stage import BLOCK_ROWS, Batch
 
 CLOSE = 1e-9  # SI: what backends may differ by
 SEED = 20261121

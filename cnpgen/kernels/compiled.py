@@ -94,7 +94,7 @@ def require_compiler() -> str:
     if compiler := find_compiler():
         return compiler
     if wanted := os.environ.get("CC"):
-        raise MachineError(f"no C compiler found: CC is {wanted!r}, which is no program here (set it right or unset it)")
+        raise MachineError(f"no C compiler found: CC is {wanted!r}, which is no program here (set or unset it)")
     raise MachineError("no C compiler found (looked for cc, gcc, clang): install gcc or clang")
 
 

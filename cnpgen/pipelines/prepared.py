@@ -15,7 +15,7 @@ from cnpgen.kernels.library import Backend, KernelLibrary, problem_identity
 from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.piece import Block, Piece
-from cnpgen.pipelines.stage import BLOCK_ROWS, Array, Batch, Run
+from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.recipes import Pipeline
 from cnpgen.robots.robot import load_robot
 
