@@ -18,6 +18,7 @@ import pytest
 import cnpgen.errors
 from cnpgen.cli import values
 from cnpgen.cli.main import main
+from cnpgen.cli.make_command import _yield
 from cnpgen.cli.plan_text import size_text
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
@@ -223,6 +224,11 @@ def test_a_finished_dataset_is_already_complete(run, hits):
 
 def test_quiet_is_quiet(run, hits):
     assert run(*MAKE, hits, "--quiet") == (0, f"{hits}\n", "")
+
+
+def test_reasons_that_round_to_nothing_are_not_summed_up():
+    outcome = Outcome(tried=10_000, accepted=7_996, rejections={"too close": 2_000, "rare": 4, "never": 0})
+    assert _yield(outcome) == "accepted 80.0% of 10,000 draws; rejected: too close 20.0%"
 
 
 def test_another_dataset_is_refused_until_it_is_forced(run, hits, tmp_path):

@@ -140,6 +140,6 @@ def _yield(outcome: "Outcome") -> str:
     """Say how many draws were accepted and why most of the others were not."""
     tried = max(outcome.tried, 1)
     worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]
-    reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count)
+    reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count >= 5e-4 * tried)
     text = f"accepted {outcome.accepted / tried:.1%} of {outcome.tried:,} draws"
     return f"{text}; rejected: {reasons}" if reasons else text
