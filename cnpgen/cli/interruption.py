@@ -59,7 +59,7 @@ def interruptible() -> Iterator[None]:
     try:
         yield
     except Exception:
-        raise_if_interrupted()  # a compiler that the same Ctrl-C ended is not the news
+        raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
         raise
     finally:
         if not _received:

@@ -12,6 +12,7 @@ from cnpgen.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from cnpgen.make import MadeDataset
     from cnpgen.outcome import Outcome
@@ -85,6 +86,10 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
 
     meter = Meter(quiet=arguments.quiet)
 
+    def begin(step: str, folder: "Path", rows: int, there: int) -> None:
+        raise_if_interrupted()
+        meter.begin(f"{step} {folder}", rows, there)
+
     def count(rows: int, outcome: "Outcome | None") -> None:
         raise_if_interrupted()
         meter(rows, outcome)
@@ -101,9 +106,12 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
             backend=arguments.backend,
             force=arguments.force,
             part=arguments.part,
-            begin=lambda step, folder, total, there: meter.begin(f"{step} {folder}", total, there),
+            begin=begin,
             progress=count,
         )
+    except Exception:
+        raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
+        raise
     finally:
         meter.close()
     if not arguments.quiet:
