@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cnpgen.verify.separation import Box, cuboid_gaps, gaps, separation
+from cnpgen.verify.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
 
 SIZE = np.array([0.2, 0.2, 0.3])
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -44,6 +44,8 @@ def test_bounds_of_a_cuboid_are_never_above_its_distance(seed: int) -> None:
         for unit in (direction, anywhere / np.linalg.norm(anywhere)):
             assert separation(vertices, box, unit)[k] <= distance + 1e-9
         assert separation(vertices, box, direction)[k] == pytest.approx(distance, abs=1e-8)
+        same = cuboid_separation(position, rotation, SIZE, box, direction)
+        np.testing.assert_allclose(same, separation(vertices, box, direction), atol=1e-14)
         tight += bool(abs(bounds[k] - distance) < 1e-9)
         overlapping += distance < 0
     assert tight > 20

@@ -123,16 +123,25 @@ def test_distances_from_the_pedestals_are_those_of_coal_at_every_state(label, by
     verdict, seen = plan.judged(), course(plan, 1501)
     world, tops = World(plan.problem, plan.robot), np.array([plan.start_xyz[0, 2], plan.goal_xyz[0, 2]]) - 0.15
     segments, objects = [], []
+
+    def distances(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[float, float]:
+        world.set_state(q, dq, ddq, tops)
+        return min(world.segment_distances()), min(world.object_distances())
+
     for state in zip(seen.q, seen.dq, seen.ddq, strict=True):
-        world.set_state(*state, tops)
-        segments.append(min(world.segment_distances()))
-        objects.append(min(world.object_distances()))
-    for name, bound, found in (("robot clearance", 0.14, segments), ("object contact", -1e-3, objects)):
+        segment, held = distances(*state)
+        segments.append(segment)
+        objects.append(held)
+    for index, (name, bound, found) in enumerate(
+        (("robot clearance", 0.14, segments), ("object contact", -1e-3, objects))
+    ):
         margin = verdict.margins[name]
-        near = 2e-4 * (1 + 10 * by)  # samples fall on either side of where two edges meet
-        assert margin.excess == pytest.approx(bound - min(found), abs=near)
-        assert margin.value == pytest.approx(min(found), abs=near)
-        assert np.interp(margin.time, seen.t, found) == pytest.approx(min(found), abs=near)
+        states = plan.motion.at(np.array([margin.phase]))
+        there = distances(states.q[0, 0], states.dq[0, 0], states.ddq[0, 0])[index]
+        assert margin.value == pytest.approx(there, abs=1e-8)
+        assert margin.excess == pytest.approx(bound - margin.value, abs=1e-12)
+        assert min(found) > margin.value - 1e-5  # nothing deeper is anywhere
+        assert np.interp(margin.phase, seen.s, found) == pytest.approx(margin.value, abs=2e-3 * (1 + 10 * by))
 
 
 def _limit(name: str, factor: float) -> Callable[[Plan], Plan]:

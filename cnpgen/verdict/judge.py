@@ -13,6 +13,7 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.verdict.closer import keep_worse, look_closer
 from cnpgen.verdict.course import course
 from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
@@ -40,8 +41,8 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
     and at more of them near both ends (``cnpgen.verdict.sampling``). A plan is valid if it meets its boundary
     conditions and exceeds every bound by no more than the constraint allows. Numbers that cannot be evaluated give a
-    verdict that says so, no exception. What lies between two samples is not seen: where edges of object and pedestal
-    pass each other, that was 0.06 mm at 1 ms.
+    verdict that says so, no exception. What lies between two samples is not seen; of contacts, whose depth has sharp
+    peaks, the deepest are looked at more closely (``cnpgen.verdict.closer``).
 
     Args:
         problem: The problem.
@@ -138,13 +139,10 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
         *boundary_margins(states, plan.boundary, samples, world.robot.joint_names),
         *constraint_margins(plan.problem, world, samples),
     ]
-    return Verdict(
-        _reason(margins),
-        by_name(margins),
-        _metrics(plan.problem, world, samples, states.jerk),
-        paper_rule(plan.problem, world, plan.tops, plan.goal_xyz),
-        len(samples.s),
-    )
+    metrics = _metrics(plan.problem, world, samples, states.jerk)
+    paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
+    margins = keep_worse(margins, look_closer(plan.problem, world, plan.motion, samples, plan.tops))
+    return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
 def _samples(plan: _Plan, step: float) -> Samples | Verdict:

@@ -72,16 +72,25 @@ def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> 
         samples: When and at which phase they are.
     """
     return [
-        _margin(problem, constraint, condition, world, samples)
+        measure_condition(problem, constraint, condition, world, samples)
         for constraint in problem.constraint
         for condition in constraint.measured(cast("World", world))  # the same questions, answered for K states
         if condition.g
     ]
 
 
-def _margin(
+def measure_condition(
     problem: Problem, constraint: Constraint, condition: Condition, world: PathWorld, samples: Samples
 ) -> Margin:
+    """Find where a motion comes closest to breaking a condition, or breaks it most.
+
+    Args:
+        problem: The problem.
+        constraint: One of its constraints.
+        condition: What the constraint measured in ``world``.
+        world: The problem's robot at the samples.
+        samples: When and at which phase they are.
+    """
     g = np.empty((len(condition.g), len(samples.s)))
     for row, value in zip(g, condition.g, strict=True):
         row[:] = value

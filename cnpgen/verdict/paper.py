@@ -86,12 +86,13 @@ def _is_on_table(table: Table, tip: Array) -> bool:
 
 def _is_clear(problem: "Problem", world: "PathWorld", tops: Array) -> bool:
     size = np.zeros(3) if problem.object is None else np.array(problem.object.size)
-    centre, corners, reach = world.tip_position, world.object_corners(), np.linalg.norm(size) / 2
+    centre, reach = world.tip_position, np.linalg.norm(size) / 2
     for box, top in zip(problem.obstacle, tops, strict=True):
         low = np.array([box.x.low, box.y.low, -np.inf if box.height is None else top - box.height])[:, None]
         high = np.array([box.x.high, box.y.high, top])[:, None]
-        apart = np.linalg.norm(centre - np.clip(centre, low, high), axis=0)
-        near = corners[..., apart < reach]  # elsewhere no corner is inside
+        offset = centre - np.clip(centre, low, high)
+        apart = np.sqrt(np.einsum("ik,ik->k", offset, offset))
+        near = world.object_corners(apart < reach)  # elsewhere none is inside
         depth = np.minimum(near - low, high - near).min(axis=1)
         if not (np.all(apart > size[2] / 2 - OBJECT) and np.all(depth < OBJECT)):
             return False

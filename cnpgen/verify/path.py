@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.verify.scene import ENDLESS, Scene
-from cnpgen.verify.separation import Box, cuboid_gaps, gaps, separation
-from cnpgen.verify.sweep import Measure, Separate, sweep
+from cnpgen.verify.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.verify.sweep import sweep
 from cnpgen.verify.trace import trace
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ class PathWorld:
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
+        self._object_distances: list[Array] | None = None
         self._boxes = [
             Box(
                 np.array([box.x.low, box.y.low, top - (box.height or ENDLESS)]), np.array([box.x.high, box.y.high, top])
@@ -150,41 +151,55 @@ class PathWorld:
             a, b = ends[pair][0][..., k].tolist()
             return self._scene.segment_apart(a, b, pair % len(boxes))
 
-        return self._swept(bounds, measure, lambda pair, direction: separation(*ends[pair], direction))
+        every = np.array(bounds).reshape(len(bounds), self.q.shape[1])
+        return list(sweep(every, measure, lambda pair, direction: separation(*ends[pair], direction)))
 
     def object_distances(self) -> list[Array]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
 
         Returns:
-            Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
+            Arrays of shape (K,), of each of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
 
         Raises:
             RecipeError: The problem has no object.
         """
-        corners, boxes, size = self.object_corners(), self._boxes, self._object_size
-        if size is None or not np.all(np.isfinite(corners)):
-            return self._unknown(len(boxes))
-        bounds = [cuboid_gaps(self.tip_position, self.tip_rotation, size, box) for box in boxes]
+        if self._object_distances is None:
+            self._require_object()
+            finite, count = bool(np.all(np.isfinite(self.tip_position))), len(self._boxes)
+            self._object_distances = list(map(self._object_distance, range(count))) if finite else self._unknown(count)
+        return self._object_distances
 
-        def measure(box: int, k: int) -> tuple[float, Array]:
-            return self._scene.object_apart(self.tip_position[:, k].copy(), self.tip_rotation[..., k].copy(), box)
+    def _object_distance(self, index: int) -> Array:
+        """Measure the signed distance of the held object from one obstacle [m], shape (K,)."""
+        position, rotation = self.tip_position, self.tip_rotation
+        size, box = self._require_object(), self._boxes[index]
 
-        return self._swept(bounds, measure, lambda box, direction: separation(corners, boxes[box], direction))
+        def measure(_: int, k: int) -> tuple[float, Array]:
+            return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), index)
 
-    def _swept(self, bounds: list[Array], measure: Measure, separate: Separate) -> list[Array]:
-        return list(sweep(np.array(bounds).reshape(len(bounds), self.q.shape[1]), measure, separate))
+        def separate(_: int, direction: Array) -> Array:
+            return cuboid_separation(position, rotation, size, box, direction)
 
-    def object_corners(self) -> Array:
-        """Compute the corners of the held object [m], shape (8, 3, K).
+        return np.asarray(sweep(cuboid_gaps(position, rotation, size, box)[None], measure, separate)[0])
 
-        Raises:
-            RecipeError: The problem has no object.
-        """
+    def _require_object(self) -> Array:
+        """Return the object's edge lengths [m], shape (3,)."""
         if self._object_size is None:
             raise RecipeError(["a constraint is about the held object, but the problem has no [object]"])
-        return np.asarray(
-            np.tensordot(_CORNERS * self._object_size, self.tip_rotation, axes=(1, 1)) + self.tip_position
-        )
+        return self._object_size
+
+    def object_corners(self, which: "slice | NDArray[np.bool_]" = slice(None)) -> Array:
+        """Compute the corners of the held object [m], shape (8, 3, K).
+
+        Args:
+            which: The states that are wanted.
+
+        Raises:
+            RecipeError: The problem has no object.
+        """
+        offsets = _CORNERS * self._require_object()
+        rotation, position = self.tip_rotation[..., which], self.tip_position[:, which]
+        return np.asarray(np.tensordot(offsets, rotation, axes=(1, 1)) + position)
 
     def segments(self) -> Array:
         """Compute both ends of every segment of the robot's skeleton [m], shape (segments, 2, 3, K)."""

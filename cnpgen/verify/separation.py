@@ -37,8 +37,29 @@ def separation(vertices: Array, box: Box, direction: Array) -> Array:
     Returns:
         Shape (K,).
     """
-    nearest = np.tensordot(direction, vertices, axes=(0, 1)).min(axis=0)
-    return np.asarray(nearest - np.sum(np.where(direction > 0, box.high, box.low) * direction))
+    return np.asarray((direction @ vertices).min(axis=0) - _furthest(box, direction))
+
+
+def cuboid_separation(position: Array, rotation: Array, size: Array, box: Box, direction: Array) -> Array:
+    """Compute how far a cuboid is from a box along a direction, at every state [m].
+
+    Args:
+        position: The cuboid's centre [m], shape (3, K).
+        rotation: Its rotation matrices, shape (3, 3, K).
+        size: Its edge lengths [m], shape (3,).
+        box: The box.
+        direction: Unit vector from the box to the cuboid, shape (3,).
+
+    Returns:
+        Shape (K,).
+    """
+    reach = (size / 2) @ np.abs(np.einsum("i,ijk->jk", direction, rotation))
+    return np.asarray(direction @ position - reach - _furthest(box, direction))
+
+
+def _furthest(box: Box, direction: Array) -> float:
+    """How far a box reaches along a direction [m]."""
+    return float(np.where(direction > 0, box.high, box.low) @ direction)
 
 
 def gaps(low: Array, high: Array, box: Box) -> Array:
