@@ -15,7 +15,7 @@ from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 FORMAT = "cnpgen-plan"
 REVISION = 2  # of the generator: raised by every change after which the same plan would give other rows
 FORMAT_VERSION = 1
-_INFORMATIONAL = ("title", "license", "versions")
+INFORMATIONAL = ("title", "license", "versions")  # what does not make a plan another one
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class DatasetPlan:
     @cached_property
     def fingerprint(self) -> str:
         """The sha256 over everything that determines the bytes of the shards."""
-        identity = {key: value for key, value in to_json(self).items() if key not in _INFORMATIONAL}
+        identity = {key: value for key, value in to_json(self).items() if key not in INFORMATIONAL}
         return canonical_sha256(identity)
 
     @property

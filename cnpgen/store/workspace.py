@@ -4,15 +4,15 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.files import machine_error, read_file, sweep
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
-from cnpgen.store.plan import DatasetPlan, load_plan, to_json, write_plan
+from cnpgen.store.plan import INFORMATIONAL, DatasetPlan, load_plan, to_json, write_plan
 
-_COMPARED = ("name", "version", "seed", "dtype", "backend", "shard_size", "recipe_sha256")
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
 _SHARD = re.compile(r"shard-\d{5,}\.(h5|json)")
 _MARK = re.compile(rb'\{\s*"format": "cnpgen-')
@@ -102,15 +102,24 @@ def _holds(folder: Path, plan: DatasetPlan) -> bool:
 
 def _refusal(found: DatasetPlan, wanted: DatasetPlan) -> str:
     """Say why a dataset cannot become another one, and what to do."""
-    old, new = to_json(found), to_json(wanted)
-    differences = [f"{key} {old[key]} instead of {new[key]}" for key in _COMPARED if old[key] != new[key]]
-    if not differences and found.splits != wanted.splits:
+    differences = _differences(to_json(found), to_json(wanted))
+    if not differences:
         return (
             f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; a dataset does not grow or shrink,"
             " but the rows that both sizes have are the same: choose another --out, or replace it with --force"
         )
-    text = "; ".join(differences[:3]) or "made by another version of cnpgen"
-    return f"holds another dataset ({text}); choose another --out, or replace it with --force"
+    return f"holds another dataset ({'; '.join(differences[:3])}); choose another --out, or replace it with --force"
+
+
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Name the settings, besides the number of rows, in which two plans differ."""
+    found = []
+    for key in old:
+        if key in INFORMATIONAL or key in {"splits", "recipe_sha256"} or old[key] == new[key]:
+            continue
+        plain = isinstance(old[key], str | int)
+        found.append(f"{key.replace('_', ' ')} {old[key]} instead of {new[key]}" if plain else f"another {key}")
+    return found
 
 
 def _sizes(plan: DatasetPlan) -> str:
