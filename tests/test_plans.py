@@ -420,6 +420,11 @@ def test_the_numbers_of_a_status_mean_what_the_file_says(
     assert [PlanStatus(status).name for status in load_plans(path).status] == expected
 
 
+def test_every_status_is_documented() -> None:
+    rows = re.findall(r"^\| (\d) \| `(\w+)` \| (.*) \|$", DOCS.read_text(encoding="utf-8"), re.M)
+    assert rows == [(str(int(status)), status.name.lower(), status.text) for status in PlanStatus]
+
+
 def test_every_status_has_a_text() -> None:
     assert len({status.text for status in PlanStatus}) == len(PlanStatus)
     assert PlanStatus.UNKNOWN == 0
