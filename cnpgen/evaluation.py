@@ -20,7 +20,7 @@ from cnpgen.workers import share_out, worker_count
 FORMAT = "cnpgen-evaluation"
 FORMAT_VERSION = 1
 STEP = 1e-3  # s
-ALONE = 400  # plans up to which a second process is not worth its start
+ALONE = 1000  # plans up to which a second process is not worth its start
 PART = 50  # plans that a process judges before it is given others
 
 _STATUS: dict[str, PlanStatus] = {

@@ -63,7 +63,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     plans = load_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty())
+    meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
     meter.begin(f"judging {arguments.file}", len(plans))
     try:
         return evaluate_plans(plans, step=arguments.step, workers=arguments.workers, progress=meter)

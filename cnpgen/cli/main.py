@@ -52,12 +52,12 @@ examples:
   cnpgen list                                        what there is
   cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
   cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
-  cnpgen validate airhockey-hit-v1 --deep            prove them with Pinocchio and Coal
+  cnpgen validate airhockey-hit-v1 --deep            prove that they are right
   cnpgen train airhockey-hit-v1 -o hits.h5           train a planner: two minutes
   cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
-  cnpgen evaluate plans.h5 --plot plan.png           judge plans with them
+  cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
 
 stdout is data, stderr everything else. Exit codes:
