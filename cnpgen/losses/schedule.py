@@ -42,8 +42,8 @@ class MetricSettings:
     """
 
     kind: Kind = "ramped"
-    growth: float = 10.0
-    ramp: tuple[float, float] = (0.1, 0.7)
+    growth: float = 30.0
+    ramp: tuple[float, float] = (0.1, 0.95)
     gamma: float = 1e-2
     every: Literal["epoch", "batch"] = "epoch"
     largest_log: float = 10.0
