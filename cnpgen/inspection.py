@@ -13,7 +13,7 @@ from cnpgen.store.documents import plain
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.plan import DatasetPlan, load_plan
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
-from cnpgen.store.summary import Summary, summarise
+from cnpgen.store.summary import Summary, summarise, unfinished
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +50,12 @@ class Inspection:
     @property
     def state(self) -> str:
         """The state of the dataset in a few words."""
-        count = f"{len(self.summary.records)} of {self.summary.n_shards} shards"
         if self.complete:
             return "complete"
         if self.sealed:
+            count = f"{len(self.summary.records)} of {self.summary.n_shards} shards"
             return f"damaged: {count} are as they were made, 'cnpgen validate' says more"
-        return f"unfinished: {count}, run make-dataset again to go on"
+        return unfinished(self.summary)
 
     @cached_property
     def rows(self) -> dict[str, int]:

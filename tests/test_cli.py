@@ -297,6 +297,19 @@ def test_a_dry_run_says_what_is_in_the_folder(run, hits, tmp_path):
     assert "something else: would be refused" in run(*MAKE, tmp_path, "--dry-run")[1]
 
 
+def test_a_dry_run_says_what_becomes_of_a_plan_that_is_damaged_or_of_which_nothing_was_made(run, hits, tmp_path):
+    folder = Path(shutil.copytree(hits, tmp_path / "hits"))
+    content = (folder / "plan.json").read_bytes()
+    (folder / "plan.json").write_bytes(content[:100])
+    assert "a damaged plan: would be refused without --force" in run(*MAKE, folder, "--dry-run")[1]
+    assert "would be replaced" in run(*MAKE, folder, "--dry-run", "--force")[1]
+    shutil.rmtree(folder / "train")
+    shutil.rmtree(folder / "validation")
+    for text in (content, content[:100]):
+        (folder / "plan.json").write_bytes(text)
+        assert "nothing was made: would be replaced" in run(*MAKE, folder, "--dry-run", "--seed", "5")[1]
+
+
 def test_the_estimated_size_is_about_right(run, hits):
     line = next(line for line in run(*MAKE, hits, "--dry-run")[1].splitlines() if "size" in line)
     estimate = float(line.split("about ")[1].split(" kB")[0]) * 1000
@@ -459,6 +472,14 @@ def test_inspect_writes_json_and_a_picture(run, hits, tmp_path):
     assert err == f"drawn: {tmp_path / 'hits.png'}\n"
     assert (tmp_path / "hits.png").stat().st_size > 10_000
     assert "ends in .png" in one_line(run("inspect", hits, "--plot", "hits.jpeg")[2])
+
+
+def test_a_picture_in_a_folder_that_is_not_there_is_refused_before_any_work(run, hits, tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in ("nothing", "file"):
+        code, out, err = run("inspect", hits, "--plot", tmp_path / folder / "hits.png")
+        assert (code, out) == (2, "")
+        assert "--plot: expected a file in a folder that is there, got " in one_line(err)
 
 
 def test_inspect_works_on_an_unfinished_dataset(run, hits, tmp_path):

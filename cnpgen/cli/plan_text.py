@@ -4,11 +4,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.describe import table
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make_plan import plan_dataset
-from cnpgen.store.layout import MANIFEST, PLAN
-from cnpgen.store.plan import DatasetPlan, load_plan, shards
+from cnpgen.store.layout import MANIFEST
+from cnpgen.store.plan import DatasetPlan, shards
 from cnpgen.store.record import pending
 from cnpgen.store.shard import storage_dtype
+from cnpgen.store.workspace import holds_plan, is_dataset
 
 if TYPE_CHECKING:
     from cnpgen.recipes import DatasetRecipe
@@ -65,12 +67,26 @@ def folder_state(folder: Path, plan: DatasetPlan, *, force: bool) -> str:
     """Say what is in the folder and what making the dataset would do to it."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return "new"
-    if not (folder / PLAN).is_file():
+    if not is_dataset(folder):
         return "holds something else: would be refused"
     if force:
         return "holds a dataset, which would be replaced"
-    if load_plan(folder).fingerprint != plan.fingerprint:
+    return _refusal(folder, plan) or _progress(folder, plan)
+
+
+def _refusal(folder: Path, plan: DatasetPlan) -> str:
+    """Say what becomes of a dataset that is not the planned one; nothing if it is."""
+    try:
+        same = holds_plan(folder, plan)
+    except UsageError:
         return "holds another dataset: would be refused without --force"
+    except DatasetError:
+        return "holds a dataset with a damaged plan: would be refused without --force"
+    return "" if same else "holds a plan of which nothing was made: would be replaced"
+
+
+def _progress(folder: Path, plan: DatasetPlan) -> str:
+    """Say how far a dataset is."""
     todo, count = len(pending(folder, plan)), len(shards(plan))
     if todo == 0 and (folder / MANIFEST).is_file():
         return "complete already"

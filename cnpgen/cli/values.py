@@ -3,6 +3,7 @@
 import re
 from argparse import ArgumentTypeError
 from decimal import Decimal
+from pathlib import Path
 
 _PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
@@ -74,9 +75,11 @@ def part(text: str) -> tuple[int, int]:
 
 
 def plot_file(text: str) -> str:
-    """Read the name of a picture file."""
+    """Read the name of a picture file that can be written, as far as its folder tells before it is drawn."""
     if not text.lower().endswith((".png", ".pdf", ".svg")):
         raise ArgumentTypeError(f"expected a file that ends in .png, .pdf or .svg, got {text!r}")
+    if not Path(text).absolute().parent.is_dir():
+        raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
     return text
 
 

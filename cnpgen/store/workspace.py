@@ -72,14 +72,14 @@ def open_workspace(folder: Path, plan: DatasetPlan) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise machine_error("create", folder, error) from error
-    if not _holds(folder, plan):
+    if not holds_plan(folder, plan):
         for name in _SUMMARIES:
             (folder / name).unlink(missing_ok=True)
         write_plan(folder, plan)
     sweep(folder / WORK)
 
 
-def _holds(folder: Path, plan: DatasetPlan) -> bool:
+def holds_plan(folder: Path, plan: DatasetPlan) -> bool:
     """Whether a folder has the plan already; if not, it may be written.
 
     Raises:
