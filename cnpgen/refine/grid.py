@@ -20,10 +20,14 @@ class Bases:
     Attributes:
         path: Basis of p and its derivatives, shape (orders, K, C).
         rate: Basis of r and its derivatives, shape (orders - 1, K, R).
+        path_at: ``path`` phase by phase, shape (K, C, orders).
+        rate_at: ``rate`` phase by phase, shape (K, R, orders - 1).
     """
 
     path: Array
     rate: Array
+    path_at: Array
+    rate_at: Array
 
     def states(self, path: Array, rate: Array) -> Array:
         """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K).
@@ -83,4 +87,4 @@ def make_grid(spec: TrajectorySpec, points: int) -> Grid:
 def _bases(spec: TrajectorySpec, s: Array, orders: int) -> Bases:
     path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
     rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]
-    return Bases(np.stack(path), np.stack(rate))
+    return Bases(np.stack(path), np.stack(rate), np.stack(path, axis=-1), np.stack(rate, axis=-1))

@@ -180,15 +180,12 @@ class Transcription:
 
     def _chain(self, stage: Array, k: Indices, rate: Array, bases: Bases) -> Array:
         """Turn derivatives in w at nodes k, shape (m, width of w), into derivatives in the variables, (m, nx)."""
-        n, spec = self.n, self.spec
-        control = np.zeros((len(k), spec.path_control_points, n))
-        for order, table in enumerate(bases.path):
-            control += table[k][:, :, None] * stage[:, None, order * n : (order + 1) * n]
-        out = np.empty((len(k), self.nx))
-        end, first = spec.path_control_points - self.boundary.fixed_at_goal, len(bases.path) * n
-        out[:, : self.split] = control[:, 3:end].reshape(len(k), -1)
-        speed = sum(stage[:, first + order, None] * table[k] for order, table in enumerate(bases.rate))
-        out[:, self.split :] = speed * rate
+        n, m, orders = self.n, len(k), len(bases.path)
+        control = bases.path_at[k] @ stage[:, : orders * n].reshape(m, orders, n)
+        out = np.empty((m, self.nx))
+        end = self.spec.path_control_points - self.boundary.fixed_at_goal
+        out[:, : self.split] = control[:, 3:end].reshape(m, -1)
+        out[:, self.split :] = (bases.rate_at[k] @ stage[:, orders * n :, None])[..., 0] * rate
         for point, variable, derivative in self._boundary_slopes(rate):
             out[:, self.split + variable] += control[:, point] @ derivative
         return out
