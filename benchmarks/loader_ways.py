@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.loader import kept
+from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 
 Tables = Iterator[NDArray[np.float32]]
@@ -82,10 +84,22 @@ class Reader:
             with h5py.File(shard.path) as file:
                 yield np.concatenate([file[name][()].reshape(shard.rows, -1) for name in self.names], axis=1)
 
-    def batches(self, **options: Any) -> Tables:
-        """Read batches with cnpgen."""
-        for batch in self.dataset.batches(self.batch_size, **options):
-            yield batch.table
+    @cached_property
+    def kept(self) -> Batches:
+        """Batches of a split that is kept in memory after its first epoch."""
+        return self.dataset.batches(self.batch_size)
+
+    def batches(self) -> Tables:
+        """Read the batches of the next epoch with cnpgen."""
+        return (batch.table for batch in self.kept)
+
+    def streamed(self, **options: Any) -> Tables:
+        """Read batches with cnpgen as if the split were too large to be kept: its files in every epoch."""
+        limit, kept.KEEP_BYTES = kept.KEEP_BYTES, 0
+        try:
+            yield from (batch.table for batch in self.dataset.batches(self.batch_size, **options))
+        finally:
+            kept.KEEP_BYTES = limit
 
     def torch_batches(self, workers: int) -> Tables:
         """Read cnpgen's batches through a torch DataLoader."""
@@ -93,8 +107,7 @@ class Reader:
 
         from cnpgen.interop.torch import BatchDataset
 
-        batches = BatchDataset(self.dataset.batches(self.batch_size))
-        return self._packed(DataLoader(batches, batch_size=None, num_workers=workers))
+        return self._packed(DataLoader(BatchDataset(self.kept), batch_size=None, num_workers=workers))
 
     def torch_rows(self, workers: int) -> Tables:
         """Read rows batch by batch from memory maps, in the order of torch's own sampler."""

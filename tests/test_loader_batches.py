@@ -4,6 +4,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from loader_example import ALL, columns, ids, make, same
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader import order, windows
+from cnpgen.loader import kept, order, windows
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -40,9 +41,10 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(make(tmp_path_factory.mktemp("loader"), splits=splits, shard_size=shard_size))
 
 
-@pytest.fixture(autouse=True)
-def _small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
+def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 20)
+    monkeypatch.setattr(kept, "KEEP_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
 
 
 def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -158,7 +160,8 @@ def test_the_state_after_any_number_of_used_batches_needs_none_to_be_taken(plain
         for used in range(len(batches)):
             assert ahead.state(epoch=1, batch=used) == batches.state()
             take(batches, 1)
-        assert ahead.state(epoch=1, batch=len(batches))["row"] == batches.state()["row"] == (48 if drop_last else 50)
+        assert ahead.state(epoch=1, batch=len(batches)) == batches.state()
+        assert (batches.state()["epoch"], batches.state()["row"]) == (2, 0)
         with pytest.raises(UsageError, match=r"an epoch has \d batches, 8 cannot have been used"):
             ahead.state(batch=8)
 
@@ -176,6 +179,21 @@ def test_a_loop_that_was_left_goes_on_and_a_finished_one_gives_the_next_epoch(pl
     assert ids(batches) == ids(plain.batches(10, fields=ALL, epoch=1)) != ids(plain.batches(10, fields=ALL))
     batches.epoch = 0
     assert ids(batches) == ids(plain.batches(10, fields=ALL))
+
+
+def test_taking_exactly_all_batches_of_an_epoch_ends_it(plain: Dataset) -> None:
+    batches = plain.batches(10, fields=ALL)
+    for epoch in range(3):
+        assert batches.epoch == epoch
+        assert ids(islice(batches, len(batches))) == ids(plain.batches(10, fields=ALL, epoch=epoch))
+
+
+def test_a_state_that_leaves_no_batch_of_another_size_leads_to_the_next_epoch(plain: Dataset) -> None:
+    small, large = plain.batches(10, fields=ALL), plain.batches(25, fields=ALL)
+    take(small, 4)
+    large.load_state(small.state())
+    assert large.epoch == 1
+    assert ids(large) == ids(plain.batches(25, fields=ALL, epoch=1))
 
 
 def test_two_loops_over_the_same_batches_are_refused(plain: Dataset) -> None:
@@ -308,7 +326,7 @@ def test_resuming_reads_one_window_and_no_earlier_one(plain: Dataset, monkeypatc
     batches.load_state(batches.state() | {"row": epoch.windows[-1].first})
     read = record_reads(monkeypatch)
     next(iter(batches))
-    assert {shard.path for shard, _ in read} == {plain.shards["train"][i].path for i in epoch.windows[-1].shards}
+    assert {shard.path for shard, _, _ in read} == {plain.shards["train"][i].path for i in epoch.windows[-1].shards}
 
 
 def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -323,25 +341,40 @@ def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, m
             running.pop()
 
     monkeypatch.setattr(windows, "pack", counted)
+    monkeypatch.setattr(kept, "pack", counted)
     read = record_reads(monkeypatch)
     rest = iter(plain.batches(1))
     next(rest)
     deadline = time.monotonic() + 10
-    while len({shard.path for shard, _ in read}) < len(plain.shards["train"]):
+    while len({shard.path for shard, _, _ in read}) < len(plain.shards["train"]):
         time.sleep(0.001)  # the second of two windows is read although nobody asked for it yet
         assert time.monotonic() < deadline
     assert sum(1 for _ in rest) == 49
     assert set(most) == {1}
-    assert threading.main_thread() not in {thread for _, thread in read}
+    assert threading.main_thread() not in {thread for _, _, thread in read}
 
 
-def record_reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Shard, threading.Thread]]:
-    """Note which shards are read by which thread."""
+def test_a_split_that_fits_is_read_once_and_a_larger_one_in_every_epoch(
+    plain: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = 50 * (2 * 4 + 8)
+    for limit, times in ((size, 1), (size - 1, 3)):
+        monkeypatch.setattr(kept, "KEEP_BYTES", limit)
+        read = record_reads(monkeypatch)
+        batches = plain.batches(10, fields=["goal_p", "sample_id"])
+        found = [ids(batches) for _ in range(3)]
+        assert found == [ids(plain.batches(10, fields=ALL, epoch=epoch)) for epoch in range(3)]
+        mine = [shard.path for shard, fields, _ in read if fields == 2]
+        assert sorted(mine) == sorted(shard.path for shard in plain.shards["train"] * times)
+
+
+def record_reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Shard, int, threading.Thread]]:
+    """Note which shards are read, how many fields of them, and by which thread."""
     found, original = [], ShardReader.read
 
-    def read(self: ShardReader, shard: Shard, *arguments: Any, **options: Any) -> Any:
-        found.append((shard, threading.current_thread()))
-        return original(self, shard, *arguments, **options)
+    def read(self: ShardReader, shard: Shard, fields: Any) -> Any:
+        found.append((shard, len(fields), threading.current_thread()))
+        return original(self, shard, fields)
 
     monkeypatch.setattr(ShardReader, "read", read)
     return found

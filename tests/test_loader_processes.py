@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from loader_example import ALL, ids, make
 
-from cnpgen.loader import order
+from cnpgen.loader import kept, order
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -22,9 +22,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(make(tmp_path_factory.mktemp("loader") / "set", shard_size=8))
 
 
-@pytest.fixture(autouse=True)
-def _small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
+def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 16)
+    monkeypatch.setattr(kept, "KEEP_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
 
 
 def rest(batches: Batches) -> list[list[int]]:

@@ -9,7 +9,7 @@ from cnpgen.loader.batches import Batches
 
 
 def to_tensorflow(batches: Batches) -> Any:
-    """Give batches as a ``tf.data.Dataset`` of dicts: every pass gives the rest of an epoch, then the next one.
+    """Give batches as a ``tf.data.Dataset`` of dicts: every pass gives the rest of an epoch.
 
     TensorFlow may take batches ahead of their use: the position is ``batches.state(epoch=..., batch=...)``.
 

@@ -32,7 +32,7 @@ def to_torch(batch: Batch) -> Tensors:
 
 
 class BatchDataset(data.IterableDataset[Tensors]):  # type: ignore[misc]
-    """Batches for a ``DataLoader(..., batch_size=None)``: every loop gives the rest of an epoch, then the next one.
+    """Batches for a ``DataLoader(..., batch_size=None)``: every loop gives the rest of an epoch.
 
     With DataLoader workers the order is the same, but every worker has a copy of the position: call
     :meth:`set_epoch` before every epoch. As each worker reads all shards, they cost more than they bring.
@@ -44,7 +44,7 @@ class BatchDataset(data.IterableDataset[Tensors]):  # type: ignore[misc]
     def __init__(self, batches: Batches) -> None:
         super().__init__()
         self.batches = batches
-        self._epoch = torch.tensor(batches.epoch).share_memory_()  # so that workers that live on see it change
+        self._told = torch.tensor(-1).share_memory_()  # the epoch, where workers that live on see it change
 
     def __len__(self) -> int:
         return len(self.batches)
@@ -53,15 +53,15 @@ class BatchDataset(data.IterableDataset[Tensors]):  # type: ignore[misc]
         worker = data.get_worker_info()
         if worker is None:
             return map(to_torch, self.batches)
-        if self.batches.epoch != int(self._epoch):
-            self.batches.epoch = int(self._epoch)
+        if int(self._told) not in (-1, self.batches.epoch):
+            self.batches.epoch = int(self._told)
         return map(to_torch, self.batches.for_worker(worker.id, worker.num_workers))
 
     def set_epoch(self, epoch: int) -> None:
         """Begin an epoch, here and in all workers; where it is the present one, go on in it."""
         if self.batches.epoch != epoch:
             self.batches.epoch = epoch
-        self._epoch.fill_(epoch)
+        self._told.fill_(epoch)
 
 
 class RowDataset(data.Dataset[Tensors]):  # type: ignore[misc]

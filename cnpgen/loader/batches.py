@@ -11,6 +11,7 @@ from cnpgen.loader.batch import Batch
 from cnpgen.loader.columns import tail
 from cnpgen.loader.cut import Cut, integer
 from cnpgen.loader.form import Form
+from cnpgen.loader.kept import Kept, make_kept
 from cnpgen.loader.order import Order
 from cnpgen.loader.position import Position, position_from_json, position_to_json
 from cnpgen.loader.source import Source
@@ -18,9 +19,10 @@ from cnpgen.loader.windows import Windows
 
 
 class Batches:
-    """Every ``for`` over it gives the rest of an epoch and leaves it at the beginning of the next one.
+    """Every ``for`` over it gives the rest of an epoch; after its last batch the next epoch begins.
 
-    The order is a function of seed, epoch and shards alone. Holds no rows between two loops, can be pickled and forked.
+    The order is a function of seed, epoch and shards alone. A split that takes at most 256 MiB is kept in memory once
+    its rows were read; of a larger one, two windows are. Can be forked, and pickled (without rows).
 
     Args:
         source: Where rows come from.
@@ -39,6 +41,10 @@ class Batches:
                 " drop_last=False gives them as one batch"
             )
         self._source, self._form, self._cut, self._position = source, form, cut, position
+        self._kept: Kept | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_kept": None}
 
     @property
     def epoch(self) -> int:
@@ -47,7 +53,7 @@ class Batches:
 
     @epoch.setter
     def epoch(self, epoch: int) -> None:
-        self._position = replace(self._position, epoch=epoch, row=0)
+        self._position = replace(self._position, epoch=integer("epoch", epoch, least=0), row=0)
 
     @property
     def signature(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
@@ -63,26 +69,37 @@ class Batches:
         return self._cut.count(self._source.rows)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Give the batches from here to the end of the epoch.
+        """Give the batches from here to the end of the epoch; with the last one it stands at the next epoch.
 
         Raises:
             DatasetError: A shard is missing or damaged.
             UsageError: Something else moved the position between two batches.
         """
-        source, cut, position = self._source, self._cut, self._position
-        rows = tuple(shard.rows for shard in source.shards)
-        order = Order(source.split, rows, position.seed, position.epoch, position.shuffle)
-        windows, end = Windows(source, self._form, order), cut.end(source.rows, first=position.row)
-        while (first := position.row + cut.worker * cut.batch_size) < end:
+        source, cut = self._source, self._cut
+        begin = position = self._position = self._forward(self._position)
+        windows, end = self._windows(begin), cut.end(source.rows, first=begin.row)
+        row = begin.row
+        while (first := row + cut.worker * cut.batch_size) < end:
             batch = windows.batch(first, min(first + cut.batch_size, end), rank=cut.rank, world=cut.world)
-            row = min(position.row + cut.workers * cut.batch_size, end)
-            self._position = position = replace(position, row=row)
+            row = min(row + cut.workers * cut.batch_size, end)
+            self._position = position = self._forward(Position(begin.seed, begin.shuffle, begin.epoch, row))
             yield batch
             if self._position is not position:
                 raise UsageError(
                     "batches were taken by another loop, or load_state was called, within a loop over the same batches"
                 )
-        self._position = replace(position, epoch=position.epoch + 1, row=0)
+
+    def _windows(self, begin: Position) -> Windows:
+        """Prepare to read an epoch."""
+        rows = tuple(shard.rows for shard in self._source.shards)
+        order = Order(self._source.split, rows, begin.seed, begin.epoch, begin.shuffle)
+        self._kept = self._kept or make_kept(self._source, self._form)
+        return Windows(self._source, self._form, order, self._kept)
+
+    def _forward(self, position: Position) -> Position:
+        """Go on to the next epoch from where no batch is left of this one."""
+        left = self._cut.end(self._source.rows, first=position.row) > position.row
+        return position if left or not position.row else replace(position, epoch=position.epoch + 1, row=0)
 
     def state(self, *, epoch: int | None = None, batch: int | None = None) -> dict[str, Any]:
         """Say where it is, as a small JSON-able dict, the same on every rank.
@@ -103,7 +120,8 @@ class Batches:
             if used > len(self):
                 raise UsageError(f"an epoch has {len(self)} batches, {used} cannot have been used")
             row = min(used * self._cut.batch_size, self._source.rows)
-            position = replace(position, epoch=position.epoch if epoch is None else epoch, row=row)
+            epoch = position.epoch if epoch is None else integer("epoch", epoch, least=0)
+            position = self._forward(replace(position, epoch=epoch, row=row))
         return position_to_json(position, self._source)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -116,7 +134,7 @@ class Batches:
             UsageError: This is not the state of a loader.
             DatasetError: It is of another dataset or split.
         """
-        self._position = position_from_json(state, self._source)
+        self._position = self._forward(position_from_json(state, self._source))
 
     def for_worker(self, worker: int, workers: int) -> "Batches":
         """Return the part of one of several workers, which take the batches from here on in turn."""

@@ -15,7 +15,7 @@ from cnpgen.loader.cut import Cut
 from cnpgen.loader.form import Form, make_form
 from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
-from cnpgen.loader.position import Position
+from cnpgen.loader.position import checked_position
 from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.loader.source import Source
 from cnpgen.loader.split import Split
@@ -114,7 +114,7 @@ class Dataset:
             DatasetError: There is no such split or field, or nothing to normalise with.
         """
         cut = Cut(batch_size=batch_size, rank=rank, world=world, drop_last=drop_last)
-        position = Position(seed=seed, shuffle=shuffle, epoch=epoch)
+        position = checked_position(seed=seed, shuffle=shuffle, epoch=epoch)
         form = self._form(fields=fields, normalize=normalize, dtype=dtype)
         return Batches(self._source(split), form, cut, position)
 

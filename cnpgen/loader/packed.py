@@ -1,7 +1,7 @@
 """Rows of whole shards packed into one table, converted and normalised as they are copied."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,34 +27,38 @@ class Packed:
     table: NDArray[Any]
     integers: dict[str, NDArray[Any]]
 
+    def part(self, first: int, last: int) -> "Packed":
+        """Return the rows from ``first`` to ``last`` as views."""
+        return Packed(self.table[first:last], {name: values[first:last] for name, values in self.integers.items()})
 
-def pack(shards: Sequence[Shard], form: Form, reader: ShardReader, *, memory: NDArray[Any] | None = None) -> Packed:
-    """Read shards whole.
 
-    Args:
-        shards: The shards.
-        form: What is wanted of their rows.
-        reader: Reads them.
-        memory: A table of the form's width and type with at least as many rows, to be used instead of a new one.
+def row_bytes(form: Form) -> int:
+    """Return how much memory a packed row takes [bytes]."""
+    return form.layout.width * form.dtype.itemsize + sum(8 * max(field.width, 1) for field in form.layout.integers)
+
+
+def empty_packed(rows: int, form: Form) -> Packed:
+    """Make room for rows."""
+    integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in form.layout.integers}
+    return Packed(np.empty((rows, form.layout.width), form.dtype), integers)
+
+
+def pack(shards: Sequence[Shard], form: Form, reader: ShardReader, *, out: Packed) -> None:
+    """Read whole shards into ``out``, end to end.
 
     Raises:
         DatasetError: A shard is missing or damaged, or the normalisation lacks a field.
         MachineError: The system would not let us read a shard.
     """
-    rows = sum(shard.rows for shard in shards)
-    layout = form.layout
-    table = np.empty((rows, layout.width), form.dtype) if memory is None else memory[:rows]
-    integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in layout.integers}
+    layout, first = form.layout, 0
     scaling = None if form.normalization is None else form.normalization.side_by_side(layout.floats)
-    first = 0
     for shard in shards:
-        columns, last = reader.read(shard, layout.fields), first + shard.rows
+        columns, part = reader.read(shard, layout.fields), out.part(first, first + shard.rows)
         if layout.floats:
-            _fill(table[first:last], {name: columns[name] for name in layout.slices}, scaling)
-        for name, values in integers.items():
-            values[first:last] = columns[name]
-        first = last
-    return Packed(table, integers)
+            _fill(part.table, {name: columns[name] for name in layout.slices}, scaling)
+        for name, values in part.integers.items():
+            values[:] = columns[name]
+        first += shard.rows
 
 
 def _fill(
@@ -64,18 +68,21 @@ def _fill(
 ) -> None:
     """Put columns side by side, chunk by chunk: the arithmetic is in float64 and stays in the cache."""
     rows, width = table.shape
-    step = max(_CHUNK // width, 1)
-    mean, scale = (None, None) if scaling is None else (np.tile(part, (step, 1)) for part in scaling)
+    step = min(max(_CHUNK // width, 1), rows)
     buffer = np.empty((step, width))
-    places = list(zip(_places(buffer, columns.values()), columns.values(), strict=True))
+    scales: Sequence[NDArray[np.float64]] = () if scaling is None else [np.tile(part, (step, 1)) for part in scaling]
+    moves = [(place, _whole_rows(columns[name])) for name, place in _places(buffer, columns).items()]
     for first in range(0, rows, step):
-        chunk = buffer[: min(step, rows - first)]
-        for place, values in places:
-            place[: len(chunk)] = _whole_rows(values[first : first + step])
-        if mean is not None and scale is not None:
-            np.subtract(chunk, mean[: len(chunk)], out=chunk)
-            np.multiply(chunk, scale[: len(chunk)], out=chunk)
-        table[first : first + step] = chunk
+        last = min(first + step, rows)
+        if last - first < step:
+            buffer, *scales = (part[: last - first] for part in (buffer, *scales))
+            moves = [(place[: last - first], values) for place, values in moves]
+        for place, values in moves:
+            np.copyto(place, values[first:last])
+        if scales:
+            np.subtract(buffer, scales[0], out=buffer)
+            np.multiply(buffer, scales[1], out=buffer)
+        table[first:last] = buffer
 
 
 def _whole_rows(values: NDArray[Any]) -> NDArray[Any]:
@@ -88,11 +95,11 @@ def _whole_rows(values: NDArray[Any]) -> NDArray[Any]:
     return rows.view(f"V{8 * rows.shape[1]}")[:, 0]
 
 
-def _places(buffer: NDArray[np.float64], columns: Iterable[NDArray[Any]]) -> list[NDArray[Any]]:
+def _places(buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """View the parts of a buffer that columns go to, side by side, as one opaque item per row."""
-    places, start = [], 0
-    for values in columns:
+    places, start = {}, 0
+    for name, values in columns.items():
         size = 8 * math.prod(values.shape[1:])
-        places.append(np.ndarray(len(buffer), f"V{size}", buffer, start, buffer.strides[:1]))
+        places[name] = np.ndarray(len(buffer), f"V{size}", buffer, start, buffer.strides[:1])
         start += size
     return places

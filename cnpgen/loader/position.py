@@ -28,9 +28,15 @@ class Position:
     epoch: int
     row: int = 0
 
-    def __post_init__(self) -> None:
-        for name in ("seed", "epoch", "row"):
-            object.__setattr__(self, name, integer(name, getattr(self, name), least=0))
+
+def checked_position(*, seed: Any, shuffle: bool, epoch: Any, row: Any = 0) -> Position:
+    """Make a position of what somebody gave.
+
+    Raises:
+        UsageError: Seed, epoch or row is no integer from 0 on.
+    """
+    numbers = {"seed": seed, "epoch": epoch, "row": row}
+    return Position(shuffle=bool(shuffle), **{name: integer(name, value, least=0) for name, value in numbers.items()})
 
 
 def position_to_json(position: Position, source: Source) -> dict[str, Any]:
@@ -55,7 +61,7 @@ def position_from_json(state: Mapping[str, Any], source: Source) -> Position:
         if state.get(name) != has:
             raise DatasetError(f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {has!r}")
     try:
-        position = Position(**{name: state[name] for name in Position.__dataclass_fields__})
+        position = checked_position(**{name: state[name] for name in Position.__dataclass_fields__})
     except KeyError as error:
         raise UsageError(f"the loader's state lacks {error}") from error
     if position.row > source.rows:

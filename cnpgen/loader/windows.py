@@ -4,7 +4,6 @@ import os
 from bisect import bisect_right
 from collections.abc import Iterator
 from concurrent.futures import Future
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,27 +11,29 @@ from numpy.typing import NDArray
 from cnpgen.loader.ahead import start
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.form import Form
+from cnpgen.loader.kept import Kept
 from cnpgen.loader.order import Order
-from cnpgen.loader.packed import Packed, pack
+from cnpgen.loader.packed import Packed, empty_packed, pack
 from cnpgen.loader.source import Source
 
 Loaded = tuple[Packed, NDArray[np.int64]]
 
 
 class Windows:
-    """Rows of an epoch by their positions; at most two windows are in memory.
+    """Rows of an epoch by their positions; at most two windows are in memory, but for what is kept.
 
     Args:
         source: Where rows come from.
         form: What is wanted of them.
         order: Their order.
+        kept: The split's rows that are in memory already; None to keep none.
     """
 
-    def __init__(self, source: Source, form: Form, order: Order) -> None:
-        self._source, self._form, self._order = source, form, order
+    def __init__(self, source: Source, form: Form, order: Order, kept: Kept | None) -> None:
+        self._source, self._form, self._order, self._kept = source, form, order, kept
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
-        self._memory: dict[int, NDArray[Any]] = {}  # of two tables, used in turn: fresh memory costs as much as packing
+        self._memory: dict[int, Packed] = {}  # of two windows, used in turn: fresh memory costs as much as packing
         self._process = os.getpid()
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:
@@ -65,11 +66,12 @@ class Windows:
         """Wait for a window, start on the one after it, forget those before it."""
         if self._process != os.getpid():  # a fork has no threads: what was being loaded would never be there
             self._process, self._futures, self._memory = os.getpid(), {}, {}
-        self._futures = {other: future for other, future in self._futures.items() if other >= index}
-        loaded = self._start(index).result()
-        if index + 1 < len(self._firsts):
-            self._start(index + 1)
-        return loaded
+        if index + 1 not in self._futures:
+            self._futures = {other: future for other, future in self._futures.items() if other == index}
+            self._start(index).result()
+            if index + 1 < len(self._firsts):
+                self._start(index + 1)
+        return self._futures[index].result()
 
     def _start(self, index: int) -> "Future[Loaded]":
         if index not in self._futures:
@@ -77,9 +79,11 @@ class Windows:
         return self._futures[index]
 
     def _pack(self, index: int) -> Loaded:
-        shards = [self._source.shards[shard] for shard in self._order.windows[index].shards]
+        window, rows = self._order.windows[index], self._order.rows_of(index)
+        if self._kept is not None:
+            return self._kept.packed, self._kept.load(window.shards)[rows]
         if index % 2 not in self._memory:
-            most = max(window.rows for window in self._order.windows)
-            self._memory[index % 2] = np.empty((most, self._form.layout.width), self._form.dtype)
-        packed = pack(shards, self._form, self._source.reader, memory=self._memory[index % 2])
-        return packed, self._order.rows_of(index)
+            self._memory[index % 2] = empty_packed(max(other.rows for other in self._order.windows), self._form)
+        packed = self._memory[index % 2]
+        pack([self._source.shards[shard] for shard in window.shards], self._form, self._source.reader, out=packed)
+        return packed, rows
