@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 
 Array = NDArray[Any]
+Weights = tuple[tuple[Array, Array], ...]  # (W, b) of every layer
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,10 @@ class Architecture:
     def all_layers(self) -> tuple[Layer, ...]:
         """Every layer, in the order of the vector of parameters."""
         return (*self.trunk, *self.heads)
+
+    def split(self, parameters: Array) -> Weights:
+        """View W and b of every layer of a vector of all parameters, shape (n_parameters,)."""
+        return tuple((layer.weight(parameters), layer.bias(parameters)) for layer in self.all_layers)
 
     @property
     def n_parameters(self) -> int:

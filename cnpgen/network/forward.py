@@ -1,4 +1,4 @@
-"""The network as functions of its parameters: forwards, and backwards from the gradient of what it gave."""
+"""The network as functions of its weights: forwards, and backwards from the gradient of what it gave."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.architecture import Architecture, Layer
+from cnpgen.network.architecture import Weights
 
 Array = NDArray[Any]
 
@@ -28,81 +28,67 @@ class Activations:
     log_rate: Array
 
 
-def forward(architecture: Architecture, parameters: Array, features: Array) -> Activations:
+def forward(weights: Weights, features: Array) -> Activations:
     """Evaluate the network.
 
     Args:
-        architecture: The architecture.
-        parameters: All parameters, shape (n_parameters,), float32 or float64.
+        weights: What ``Architecture.split`` gives, float32 or float64.
         features: Inputs, shape (N, inputs), of the same type.
     """
+    *trunk_weights, hidden_weights, path_weights, (rate_weight, rate_bias) = weights
     trunk = [features]
-    for layer in architecture.trunk:
-        trunk.append(_tanh_layer(layer, parameters, trunk[-1]))
-    hidden_layer, path_layer, rate_layer = architecture.heads
-    hidden = _tanh_layer(hidden_layer, parameters, trunk[-1])
-    path = _tanh_layer(path_layer, parameters, hidden)
-    log_rate = trunk[-1] @ rate_layer.weight(parameters)
-    log_rate += rate_layer.bias(parameters)
-    return Activations(tuple(trunk), hidden, path, log_rate)
+    for layer in trunk_weights:
+        trunk.append(_tanh_layer(layer, trunk[-1]))
+    hidden = _tanh_layer(hidden_weights, trunk[-1])
+    log_rate = trunk[-1] @ rate_weight
+    log_rate += rate_bias
+    return Activations(tuple(trunk), hidden, _tanh_layer(path_weights, hidden), log_rate)
 
 
-def _tanh_layer(layer: Layer, parameters: Array, x: Array) -> Array:
-    y: Array = x @ layer.weight(parameters)
-    y += layer.bias(parameters)
+def _tanh_layer(layer: tuple[Array, Array], x: Array) -> Array:
+    weight, bias = layer
+    y: Array = x @ weight
+    y += bias
     np.tanh(y, out=y)
     return y
 
 
 def backward(
-    architecture: Architecture,
-    parameters: Array,
-    activations: Activations,
-    *,
-    path_gradient: Array,
-    log_rate_gradient: Array,
-    out: Array,
+    weights: Weights, activations: Activations, *, path_gradient: Array, log_rate_gradient: Array, out: Weights
 ) -> None:
-    """Write the gradient of a scalar with respect to all parameters.
+    """Write the gradient of a scalar with respect to all weights.
 
     Args:
-        architecture: The architecture.
-        parameters: What the activations were computed with.
+        weights: What the activations were computed with.
         activations: What ``forward`` gave.
         path_gradient: Gradient of the scalar with respect to ``activations.path``, shape (N, path_outputs).
         log_rate_gradient: Likewise to ``activations.log_rate``, shape (N, rate_outputs).
-        out: Where to, shape (n_parameters,).
+        out: Where to, as ``weights``.
     """
-    hidden_layer, path_layer, rate_layer = architecture.heads
-    top = activations.trunk[-1]
+    top, hidden = activations.trunk[-1], activations.path_hidden
     gradient = _through_tanh(path_gradient, activations.path)
-    gradient = _layer_gradient(path_layer, parameters, activations.path_hidden, gradient, out)
-    gradient = _through_tanh(gradient, activations.path_hidden)
-    gradient = _layer_gradient(hidden_layer, parameters, top, gradient, out)
-    gradient += _layer_gradient(rate_layer, parameters, top, log_rate_gradient, out)
-    for layer, x, y in zip(architecture.trunk[::-1], activations.trunk[-2::-1], activations.trunk[:0:-1], strict=True):
-        gradient = _through_tanh(gradient, y)
-        if layer.start:
-            gradient = _layer_gradient(layer, parameters, x, gradient, out)
-        else:  # nobody asks for the gradient of the features
-            _parameter_gradient(layer, x, gradient, out)
+    _weight_gradient(hidden, gradient, out[-2])
+    gradient = _through_tanh(gradient @ weights[-2][0].T, hidden)
+    _weight_gradient(top, gradient, out[-3])
+    _weight_gradient(top, log_rate_gradient, out[-1])
+    gradient = gradient @ weights[-3][0].T
+    gradient += log_rate_gradient @ weights[-1][0].T
+    for index in range(len(weights) - 4, -1, -1):
+        gradient = _through_tanh(gradient, activations.trunk[index + 1])
+        _weight_gradient(activations.trunk[index], gradient, out[index])
+        if index:  # nobody asks for the gradient of the features
+            gradient = gradient @ weights[index][0].T
 
 
 def _through_tanh(gradient: Array, y: Array) -> Array:
     """Gradient before a tanh from that behind it: times ``1 - y^2``."""
-    slope = y * y
+    slope: Array = y * y
     np.subtract(1.0, slope, out=slope)
     slope *= gradient
     return slope
 
 
-def _layer_gradient(layer: Layer, parameters: Array, x: Array, gradient: Array, out: Array) -> Array:
-    """Write a layer's part of the gradient; return the gradient of its input, shape (N, inputs)."""
-    _parameter_gradient(layer, x, gradient, out)
-    before: Array = gradient @ layer.weight(parameters).T
-    return before
-
-
-def _parameter_gradient(layer: Layer, x: Array, gradient: Array, out: Array) -> None:
-    np.matmul(x.T, gradient, out=layer.weight(out))
-    np.sum(gradient, axis=0, out=layer.bias(out))
+def _weight_gradient(x: Array, gradient: Array, out: tuple[Array, Array]) -> None:
+    """Write the gradient of a layer's weights from its input and the gradient behind it."""
+    np.matmul(x.T, gradient, out=out[0])
+    np.sum(gradient, axis=0, out=out[1])

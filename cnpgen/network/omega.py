@@ -6,6 +6,7 @@ line that hangs on two of them: gradients of the path reach the rates on both wa
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -46,9 +47,10 @@ def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, s
     rate = np.exp(log_rate)
     rate /= tasks.expected_time[:, None]
     first, last = start_points(boundary, rate, spec), goal_points(boundary, rate, spec)
-    interior = (scale * phi).reshape(len(phi), -1, boundary.start_q.shape[1])
-    along = _along(interior.shape[1], interior.dtype)
-    interior += first[:, 2:3] * (1 - along) + last[:, :1] * along
+    n = boundary.start_q.shape[1]
+    interior = (scale * phi).reshape(len(phi), phi.shape[1] // n, n)
+    begin = first[:, 2:3]
+    interior += begin + (last[:, :1] - begin) * along_line(interior.shape[1], interior.dtype.name)
     if tasks.correction is not None:
         interior += tasks.correction
     return ControlPoints(np.concatenate([first, interior, last], axis=1), rate)
@@ -77,7 +79,7 @@ def pull_back(
         Gradients with respect to phi, shape (N, m n), and to the logarithms of the rates, shape (N, R).
     """
     interior = path_gradient[:, 3 : spec.path_control_points - tasks.boundary.fixed_at_goal]
-    along = _along(interior.shape[1], interior.dtype)[:, 0]
+    along = along_line(interior.shape[1], interior.dtype.name)[:, 0]
     total = path_gradient.copy()
     total[:, 2] += (1 - along) @ interior
     total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += along @ interior
@@ -88,6 +90,7 @@ def pull_back(
     return scale * interior.reshape(len(interior), -1), rates
 
 
-def _along(count: int, dtype: np.dtype[Any]) -> Array:
+@lru_cache(maxsize=16)
+def along_line(count: int, dtype: str = "float64") -> Array:
     """How far along the line from C_2 to C_{C-N_d} the interior control points are, shape (m, 1)."""
     return np.linspace(0, 1, count, dtype=dtype)[:, None]

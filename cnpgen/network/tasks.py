@@ -66,5 +66,5 @@ def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
     Returns:
         Shape (N,).
     """
-    needed: Array = np.max(np.abs(boundary.goal_q - boundary.start_q) / velocity_limit, axis=1)
-    return np.maximum(needed, SHORTEST_TIME)
+    needed: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
+    return np.maximum(needed.max(axis=1), SHORTEST_TIME)

@@ -1,49 +1,47 @@
 """A baseline on the manifold: the straight line between the boundary control points, bent onto the equalities.
 
 The paper's network corrects a straight line in joint space, which leaves the manifold by far: a heavy object tilts by
-some 10 degrees on the way. A few Gauss-Newton steps on the interior control points remove that before the network
-runs, with the smallest change of the second differences.
+some 10 degrees on the way. A Gauss-Newton step of the interior control points removes nearly all of that before the
+network runs, with the smallest change of their second differences.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.recipes import TrajectorySpec
-from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.network.omega import along_line
+from cnpgen.planner.expressions import equality_residuals
+from cnpgen.recipes import Problem, TrajectorySpec
+from cnpgen.robots.linalg import dot, solve
+from cnpgen.robots.symbolic import symbols
+from cnpgen.trajectory.boundary import Boundary, goal_points, start_points
 from cnpgen.trajectory.spline import basis, clamped_knots
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
 STRAIGHT = 0.05  # weight of the change itself beside that of its second differences
 DAMPING = 1e-6  # keeps steps small where the equalities hardly depend on the joints
 LONGEST = 0.6  # rad: no step moves a control point further
-BLOCK = 256  # tasks at once, so that arrays stay in the cache
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """How the line is bent; made once per problem by ``make_baseline``.
+    """What bends the line of one problem; made by ``make_baseline``.
 
     Attributes:
-        residuals: Kernel of ``expressions.equality_residuals``.
-        equalities: Number m of equalities.
+        bend: Kernel of ``bent_line``.
         spec: Degree and numbers of control points.
-        steps: Number of Gauss-Newton steps.
-        path: Basis of all control points at the K collocation phases, shape (K, C).
-        response: How control points follow a force at the phases, shape (interior points, K).
-        coupling: How the phases follow it, shape (K, K).
     """
 
-    residuals: Kernel
-    equalities: int
+    bend: Kernel
     spec: TrajectorySpec
-    steps: int
-    path: Array
-    response: Array
-    coupling: Array
 
     def correction(self, boundary: Boundary, rate: Array, tops: Array) -> Array:
         """Compute what the interior control points deviate from the straight line by.
@@ -56,59 +54,109 @@ class Baseline:
         Returns:
             Shape (N, interior points, n) [rad].
         """
-        parts = [slice(first, first + BLOCK) for first in range(0, len(rate), BLOCK)]
-        found = [self._bent(boundary[part], rate[part], tops[part]) for part in parts]
-        interior = self.spec.path_control_points - 3 - boundary.fixed_at_goal
-        return np.concatenate([np.empty((0, interior, boundary.start_q.shape[1])), *found])
-
-    def _bent(self, boundary: Boundary, rate: Array, tops: Array) -> Array:
-        rates = np.repeat(rate[:, None], self.spec.rate_control_points, axis=1)
-        line = anchor_line(boundary, rates, self.spec)
-        fixed = self.path @ assemble(boundary, line, rates, self.spec)
-        inner = self.path[:, 3 : 3 + line.shape[1]]
-        heights = np.repeat(tops.T, len(self.path), axis=1)
-        change = np.zeros_like(line)
-        for _ in range(self.steps):
-            change += self._step(fixed + inner @ change, heights)
-        return change
-
-    def _step(self, q: Array, heights: Array) -> Array:
-        """One Gauss-Newton step of the interior control points from positions q at the phases, shape (N, K, n)."""
-        rows, count, n = q.shape
-        residual, slopes = self.residuals(np.ascontiguousarray(q.reshape(-1, n).T), heights)
-        m = self.equalities
-        jacobian = slopes.reshape(n, m, rows, count).transpose(2, 1, 3, 0).reshape(rows, m * count, n)
-        system = (jacobian @ jacobian.transpose(0, 2, 1)).reshape(rows, m, count, m, count)
-        system *= self.coupling[None, None, :, None, :]
-        system = system.reshape(rows, m * count, m * count)
-        system += DAMPING * np.eye(m * count)
-        wanted = -residual.reshape(m, rows, count).transpose(1, 0, 2).reshape(rows, m * count, 1)
-        force = jacobian * np.linalg.solve(system, wanted)
-        step: Array = self.response @ force.reshape(rows, m, count, n).sum(axis=1)
-        size = np.abs(step).max(axis=(1, 2), initial=0.0)
-        step *= np.minimum(1.0, LONGEST / np.maximum(size, LONGEST))[:, None, None]
-        return step
+        rates = rate[:, None] * np.ones(self.spec.rate_control_points)
+        first, last = start_points(boundary, rates, self.spec), goal_points(boundary, rates, self.spec)
+        ends = np.concatenate([first, last], axis=1)
+        rows, fixed, n = ends.shape
+        ends = ends.reshape(rows, fixed * n)
+        (change,) = self.bend(np.ascontiguousarray(ends.T), np.ascontiguousarray(tops.T))
+        return change.T.reshape(rows, self.spec.path_control_points - fixed, n)
 
 
-def make_baseline(
-    residuals: Kernel, equalities: int, spec: TrajectorySpec, *, fixed_at_goal: int = 2, steps: int = 3
-) -> Baseline:
-    """Prepare a baseline: one collocation phase per interior control point, where that point counts most.
+def make_baseline(problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2) -> Baseline:
+    """Load the baseline of a problem that has equalities.
 
     Args:
-        residuals: Kernel of ``expressions.equality_residuals``.
-        equalities: Number of equalities, at least 1.
-        spec: Degree and numbers of control points.
+        problem: The problem.
+        kernels: Where kernels are loaded from.
+        steps: Number of Gauss-Newton steps, at least 1.
         fixed_at_goal: Control points that the goal fixes.
+    """
+    spec = problem.trajectory
+    shape = (spec.degree, spec.path_control_points, fixed_at_goal)
+    return Baseline(kernels.load(bent_line, shape=shape, steps=steps), spec)
+
+
+def bent_line(robot: "Robot", problem: Problem, *, shape: tuple[int, int, int], steps: int) -> Any:
+    """Build ``(ends, tops) -> change``: control points at the ends in, change of the interior ones out, point by point.
+
+    Args:
+        robot: The robot.
+        problem: The problem.
+        shape: Degree, number of control points, and how many of them the goal fixes.
         steps: Number of Gauss-Newton steps.
     """
-    points, degree = spec.path_control_points, spec.degree
-    knots = clamped_knots(points, degree)
-    interior = range(3, points - fixed_at_goal)
-    phases = np.array([knots[i + 1 : i + degree + 1].mean() for i in interior])  # Greville's abscissae
+    import casadi as ca
+
+    degree, points, fixed_at_goal = shape
+    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
+    tops_sx, _ = symbols("tops", len(problem.obstacle))
+    given = [ends[i : i + robot.n] for i in range(0, len(ends), robot.n)]
+    table, response = _collocation(degree, points, fixed_at_goal)
+    along, begin, end = along_line(response.shape[0])[:, 0], given[2], given[3]
+    line = [[a + (b - a) * float(t) for a, b in zip(begin, end, strict=True)] for t in along]
+    control = [*given[:3], *line, *given[3:]]
+    equality = equality_residuals(robot, problem)
+    for _ in range(steps):
+        q = [_combined(row, control) for row in table]
+        step = _gauss_newton(equality, q, tops_sx, table[:, 3 : 3 + len(line)], response)
+        control[3 : 3 + len(line)] = [
+            [x + d for x, d in zip(*pair, strict=True)] for pair in zip(control[3 : 3 + len(line)], step, strict=True)
+        ]
+    moved = zip(control[3 : 3 + len(line)], line, strict=True)
+    change = [x - x0 for new, old in moved for x, x0 in zip(new, old, strict=True)]
+    return ca.Function("bent_line", [ends_sx, tops_sx], ca.cse([ca.vertcat(*change)]))
+
+
+def _gauss_newton(equality: Any, q: list[list[Any]], tops: Any, inner: Array, response: Array) -> list[list[Any]]:
+    """One step: change of the interior control points that cancels the residuals at the phases to first order.
+
+    Args:
+        equality: Function of ``equality_residuals``.
+        q: Positions at the K phases.
+        tops: Heights of the obstacles.
+        inner: Basis of the interior control points at the phases, shape (K, interior points).
+        response: How control points follow a force at the phases, shape (interior points, K).
+    """
+    import casadi as ca
+
+    residuals, rows, phases = [], [], []
+    for phase, position in enumerate(q):
+        residual, jacobian = equality(ca.vertcat(*position), tops)
+        columns = ca.reshape(jacobian, residual.numel(), len(position))
+        for equation in range(residual.numel()):
+            residuals.append(residual[equation])
+            rows.append(ca.vertsplit(columns[equation, :].T))
+            phases.append(phase)
+    coupling = inner @ response
+    lower = [
+        [dot(rows[i], rows[j]) * float(coupling[phases[i], phases[j]]) for j in range(i + 1)] for i in range(len(rows))
+    ]
+    for i, entries in enumerate(lower):
+        entries[i] += DAMPING
+    force = solve(lower, residuals)
+    pulled: list[list[Any]] = [[0.0] * len(q[0]) for _ in q]
+    for strength, row, phase in zip(force, rows, phases, strict=True):
+        pulled[phase] = [total + strength * slope for total, slope in zip(pulled[phase], row, strict=True)]
+    return [[ca.fmin(ca.fmax(-x, -LONGEST), LONGEST) for x in _combined(row, pulled)] for row in response]
+
+
+def _combined(factors: Array, points: list[list[Any]]) -> list[Any]:
+    """Return the sum of points times factors; what is zero costs nothing."""
+    used = [(float(factor), point) for factor, point in zip(factors, points, strict=True) if factor]
+    return [sum(factor * point[joint] for factor, point in used) for joint in range(len(points[0]))]
+
+
+def _collocation(degree: int, points: int, fixed_at_goal: int) -> tuple[Array, Array]:
+    """Return the basis at one phase per interior control point, where that point counts most, and their response.
+
+    Returns:
+        Shape (K, points) and (interior points, K), with K interior points.
+    """
+    knots, interior = clamped_knots(points, degree), slice(3, points - fixed_at_goal)
+    chosen = range(points)[interior]
+    phases = np.array([knots[i + 1 : i + degree + 1].mean() for i in chosen])  # Greville's abscissae
     table = basis(phases, points, degree)
-    inner = table[:, 3 : points - fixed_at_goal]
-    second = np.diff(np.eye(points), 2, axis=0)[:, 3 : points - fixed_at_goal]
+    second = np.diff(np.eye(points), 2, axis=0)[:, interior]
     mobility = np.linalg.inv(second.T @ second + STRAIGHT * np.eye(len(phases)))
-    response = mobility @ inner.T
-    return Baseline(residuals, equalities, spec, steps, table, response, inner @ response)
+    return table, mobility @ table[:, interior].T

@@ -1,5 +1,7 @@
 """Boundary conditions as callers write them: one motion or many, rest left out."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -54,7 +56,7 @@ def _rows(name: str, values: ArrayLike, n: int) -> Array:
     if array.ndim not in {1, 2} or array.shape[-1] != n:
         raise UsageError(f"{name} must have shape ({n},) or (N, {n}), got {array.shape}")
     rows = array.reshape(-1, n)
-    if not np.isfinite(rows).all():
+    if not math.isfinite(rows.sum()) and not np.isfinite(rows).all():
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise UsageError(f"{name} must be finite, got {rows[row]} in row {row}")
     return rows

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.architecture import Architecture
+from cnpgen.network.architecture import Architecture, Weights
 from cnpgen.network.features import Features
 from cnpgen.network.forward import forward
 from cnpgen.network.omega import ControlPoints, control_points
@@ -58,7 +58,7 @@ class Model:
 
     def control_points(self, tasks: Tasks) -> ControlPoints:
         """Plan N tasks: the network in float32, boundary control points and all sums in float64."""
-        given = forward(self.architecture, self.parameters, self.features.of(tasks))
+        given = forward(self._weights, self.features.of(tasks))
         return control_points(
             tasks,
             given.path.astype(np.float64),
@@ -66,6 +66,10 @@ class Model:
             scale=self.meaning.path_scale,
             spec=self.problem.trajectory,
         )
+
+    @cached_property
+    def _weights(self) -> Weights:
+        return self.architecture.split(self.parameters)
 
     @property
     def rests(self) -> bool:

@@ -108,8 +108,8 @@ class Planner:
 
     def _check_rest(self, boundary: Boundary) -> None:
         for name in self.model.rest:
-            moving = np.abs(getattr(boundary, name)).max(axis=1, initial=0.0)
-            if np.any(moving > 0):
+            if getattr(boundary, name).any():
+                moving = np.abs(getattr(boundary, name)).max(axis=1)
                 row = int(moving.argmax())
                 raise UsageError(
                     f"{name} was zero in every row that the model was trained on, got {moving[row]:g} in plan {row}:"

@@ -74,7 +74,7 @@ class Slowing:
             _smallest(self.upper[:, None] - rest, linear, quadratic),
             _smallest(rest - self.lower[:, None], -linear, -quadratic),
         )
-        factor: Array = needed.max(axis=0, initial=1.0).reshape(len(motion), -1).max(axis=1)
+        factor: Array = needed.max(axis=0, initial=1.0).reshape(len(motion), self.path.shape[1]).max(axis=1)
         return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
 
 

@@ -44,10 +44,10 @@ class TrainingSettings:
     final_rate: float = 0.01
     warm_up: int = 200
     seed: int = 0
-    path_scale: float = 0.3
+    path_scale: float = 0.5
     head_scale: float = 0.1
     rate_bias: float = -0.5
-    bending_steps: int = 2
+    bending_steps: int = 1
     nodes: int = 32
     shifts: int = 16
     sample_clip: float = 30.0

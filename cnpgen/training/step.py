@@ -55,7 +55,8 @@ class Learner:
         Returns:
             The terms of every sample, shape (N, 1 + m).
         """
-        given = forward(self.architecture, parameters, rows.features)
+        network = self.architecture.split(parameters)
+        given = forward(network, rows.features)
         scale, spec = self.settings.path_scale, self.spec
         points = control_points(rows.tasks, given.path, given.log_rate, scale=scale, spec=spec)
         value = self.loss(
@@ -76,7 +77,8 @@ class Learner:
         factors = self._factors(phi, log_rate, clipping)
         phi *= factors
         log_rate *= factors
-        backward(self.architecture, parameters, given, path_gradient=phi, log_rate_gradient=log_rate, out=out)
+        gradient = self.architecture.split(out)
+        backward(network, given, path_gradient=phi, log_rate_gradient=log_rate, out=gradient)
         return value.terms
 
     def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
@@ -90,8 +92,10 @@ class Learner:
         return (factors / len(factors))[:, None]
 
     def update(self, adam: Adam, clipping: Clipping, gradient: Array, *, rate: float) -> None:
-        """Clip the gradient of a batch and take Adam's step."""
+        """Clip the gradient of a batch and take Adam's step; one that is not finite is only counted as a step."""
         norm = float(np.sqrt(np.dot(gradient, gradient)))
         if np.isfinite(norm):
             gradient *= clipping.batch_factor(norm, limit=self.settings.batch_clip)
             adam.update(gradient, rate=rate, memory=self.settings.memory)
+        else:
+            adam.step += 1

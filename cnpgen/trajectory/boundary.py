@@ -81,10 +81,12 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     """
     path, speed = _end_derivatives(spec)
     # Reversed in phase, r' and p' change sign: the goal is a start with -dq.
+    if boundary.goal_ddq is None:
+        before = boundary.goal_q - boundary.goal_dq / rate[:, -1:] / path.eta
+        return np.concatenate([before[:, None], boundary.goal_q[:, None]], axis=1)
     slope = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
-    acceleration = np.zeros_like(boundary.goal_q) if boundary.goal_ddq is None else boundary.goal_ddq
-    points = _three(boundary.goal_q, -boundary.goal_dq, acceleration, rate[:, -1:], slope=slope, path=path)
-    return points[:, boundary.fixed_at_goal - 1 :: -1]
+    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], slope=slope, path=path)
+    return points[:, ::-1]
 
 
 def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivatives]:
@@ -105,7 +107,9 @@ def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, slope: Array, path: 
     second = (ddq - first * slope * rate) / rate**2  # p''(0), from ddq = p'' r^2 + p' r' r
     c1 = q + first / eta
     c2 = second / beta - 2 * q + 3 * c1
-    return np.stack([q, c1, c2], axis=1)
+    points = np.empty((len(q), 3, q.shape[1]), c2.dtype)  # np.stack takes as long as all that came before
+    points[:, 0], points[:, 1], points[:, 2] = q, c1, c2
+    return points
 
 
 def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectorySpec) -> Array:

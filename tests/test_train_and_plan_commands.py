@@ -1,0 +1,153 @@
+"""``cnpgen train`` and ``cnpgen plan``: what they write, print and refuse."""
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import columns_of
+
+from cnpgen.cli.main import main
+from cnpgen.planner.model_file import load_model
+from cnpgen.plans import load_plans
+
+SMALL = ["--steps", "40", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--workers", "1"]
+
+
+@pytest.fixture(scope="module")
+def trained(tiny, tmp_path_factory) -> Path:
+    """A small model of the hits, made by the command."""
+    path = tmp_path_factory.mktemp("trained") / "hits.h5"
+    assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL, "--quiet"]) == 0
+    return path
+
+
+def failing(capsys, words: list[str]) -> tuple[int, str]:
+    code = main(words)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "Traceback" not in captured.err
+    return code, captured.err
+
+
+def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tmp_path, capsys):
+    path = tmp_path / "hits.h5"
+    assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{path}\n"
+    for word in ("training", "valid", "of its budget (weight", "learning rate", "is kept"):
+        assert word in captured.err
+    assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert len(path.with_suffix(".jsonl").read_text().splitlines()) >= 40
+    training = load_model(path).training
+    assert training["command"] == (
+        "cnpgen train airhockey-hit -o hits.h5 --steps 40 --hidden 16 --layers 2 --batch-size 32"
+    )
+    assert training["score"]["plans"] == 60
+    assert training["dataset"]["rows"] == {"train": 600, "validation": 60}
+
+
+def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
+    code, text = failing(capsys, ["train", str(tiny("airhockey-hit")), "-o", str(trained), *SMALL])
+    assert code == 2
+    assert "exists already" in text
+
+
+@pytest.mark.parametrize(
+    "words", [["--metric", "paper"], ["--steps", "0"], ["--steps", "5", "--epochs", "2"], ["--learning-rate", "-1"]]
+)
+def test_train_refuses_what_cannot_be_meant(tiny, tmp_path, capsys, words):
+    code, text = failing(capsys, ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *words])
+    assert code == 2
+    assert text.count("\n") == 1
+
+
+def test_plans_of_a_dataset_are_for_its_rows(trained, tiny, tmp_path, capsys):
+    out, folder = tmp_path / "plans.h5", tiny("airhockey-hit")
+    assert main(["plan", str(folder), "--model", str(trained), "-o", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{out}\n"
+    assert "60 plans in" in captured.err
+    plans, rows = load_plans(out, problem="airhockey"), columns_of(folder, "validation")
+    np.testing.assert_array_equal(plans.boundary.goal_q, rows["goal_q"])
+    np.testing.assert_array_equal(plans.sample_id, rows["sample_id"])
+    np.testing.assert_array_equal(plans.columns["hit_speed"], rows["hit_speed"])
+    assert main(["evaluate", str(out), "--json"]) in {0, 1}
+    assert json.loads(capsys.readouterr().out)["plans"] == 60
+
+
+def test_some_rows_of_another_split_can_be_chosen(trained, tiny, tmp_path):
+    out, folder = tmp_path / "plans.h5", tiny("airhockey-hit")
+    words = ["plan", str(folder), "--model", str(trained), "-o", str(out), "--quiet"]
+    assert main([*words, "--split", "train", "--first", "10", "--n", "5"]) == 0
+    np.testing.assert_array_equal(load_plans(out).sample_id, np.arange(10, 15))
+
+
+def test_a_file_of_boundary_conditions_is_planned_for_and_what_it_lacks_is_at_rest(trained, tiny, tmp_path):
+    rows, path, out = columns_of(tiny("airhockey-hit")), tmp_path / "problems.h5", tmp_path / "plans.h5"
+    with h5py.File(path, "w") as file:
+        for name in ("start_q", "goal_q", "goal_dq"):
+            file[name] = rows[name][:7]
+    assert main(["plan", str(path), "--model", str(trained), "-o", str(out), "--quiet"]) == 0
+    found = load_plans(out)
+    np.testing.assert_array_equal(found.boundary.goal_dq, rows["goal_dq"][:7])
+    np.testing.assert_array_equal(found.boundary.start_dq, 0)
+    again = tmp_path / "again.h5"  # a file of plans holds boundary conditions, too
+    assert main(["plan", str(out), "--model", str(trained), "-o", str(again), "--quiet"]) == 0
+    np.testing.assert_array_equal(load_plans(again).path_control_points, found.path_control_points)
+
+
+def test_a_dataset_of_another_problem_is_refused_with_what_differs(trained, tiny, tmp_path, capsys):
+    words = ["plan", str(tiny("heavy-object")), "--model", str(trained), "-o", str(tmp_path / "p.h5")]
+    code, text = failing(capsys, words)
+    assert code == 1
+    assert "plans for 'airhockey'" in text
+    assert "is of 'heavy-object'" in text
+    assert "they differ in" in text
+
+
+def test_rows_that_are_drawn_in_another_way_are_refused_unless_they_are_meant(trained, tiny, tmp_path, capsys):
+    folder, out = tiny("airhockey-replan"), tmp_path / "p.h5"
+    words = ["plan", str(folder), "--model", str(trained), "-o", str(out)]
+    code, text = failing(capsys, words)
+    assert code == 1
+    assert "drawn in another way" in text
+    assert "--other-rows" in text
+    code, text = failing(capsys, [*words, "--other-rows"])  # they move, and the model was trained at rest
+    assert code == 2
+    assert "start_dq was zero in every row" in text
+
+
+def test_a_truncated_model_an_unknown_one_and_a_file_that_is_none_are_one_line_each(trained, tiny, tmp_path, capsys):
+    cut = Path(shutil.copy(trained, tmp_path / "cut.h5"))
+    cut.write_bytes(cut.read_bytes()[:2000])
+    folder, rest = str(tiny("airhockey-hit")), ["-o", str(tmp_path / "p.h5")]
+    for model, code, word in ((str(cut), 1, "cut off"), ("airhockey-hot", 2, "unknown model"), ("x.h5", 1, "missing")):
+        found, text = failing(capsys, ["plan", folder, "--model", model, *rest])
+        assert (found, text.count("\n")) == (code, 1)
+        assert word in text
+
+
+def test_options_of_rows_are_not_taken_for_a_file(trained, tmp_path, capsys):
+    (tmp_path / "p.h5").write_bytes(b"")
+    words = ["plan", str(tmp_path / "p.h5"), "--model", str(trained), "-o", str(tmp_path / "o.h5"), "--split", "train"]
+    code, text = failing(capsys, words)
+    assert code == 2
+    assert "for the folder of a dataset" in text
+
+
+def test_a_file_without_goals_or_of_another_problem_is_an_error(trained, tmp_path, capsys):
+    path = tmp_path / "p.h5"
+    words = ["plan", str(path), "--model", str(trained), "-o", str(tmp_path / "o.h5")]
+    with h5py.File(path, "w") as file:
+        file["start_q"] = np.zeros((2, 6))
+    assert "lacks goal_q" in failing(capsys, words)[1]
+    with h5py.File(path, "w") as file:
+        file["start_q"], file["goal_q"] = np.zeros((2, 7)), np.zeros((2, 7))
+    assert "must have shape (6,) or (N, 6)" in failing(capsys, words)[1]
+    with h5py.File(path, "w") as file:
+        file["start_q"], file["goal_q"] = np.zeros((2, 6)), np.zeros((2, 6))
+        file.attrs["problem_sha256"] = "0" * 64
+    assert "another problem than the model" in failing(capsys, words)[1]

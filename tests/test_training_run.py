@@ -1,0 +1,183 @@
+"""Runs: cut and resumed they give the bits of an uncut one; what goes wrong is said."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import tiny_recipe
+from example_models import SMALL
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.losses.schedule import BOUNDED
+from cnpgen.make import make_dataset
+from cnpgen.planner.model import Model
+from cnpgen.planner.model_file import load_model
+from cnpgen.training import checkpoint as checkpoints
+from cnpgen.training.train import Trained, train_model
+
+STEPS = 30
+Train = Callable[..., Trained]
+
+
+class CutOffError(Exception):
+    """Raised in the middle of a run."""
+
+
+@pytest.fixture
+def train(tiny: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Train:
+    """Train a small model of the hits; checkpoints are written all the time."""
+    monkeypatch.setattr(checkpoints, "EVERY", 0.0)
+    monkeypatch.setattr(checkpoints, "SHARE", 3.0)
+
+    def run(out: str = "model.h5", **options: Any) -> Trained:
+        arguments = {"steps": STEPS, "settings": SMALL, "check_rows": 2, "workers": 1, **options}
+        return train_model(tiny("airhockey-hit"), tmp_path / out, **arguments)
+
+    return run
+
+
+def cut_at(step: int) -> Callable[[Any], None]:
+    def watch(record: Any) -> None:
+        if record["step"] >= step:
+            raise CutOffError
+
+    return watch
+
+
+def lines(model: Model) -> list[dict[str, Any]]:
+    """The log without times."""
+    return [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in model.log.splitlines()]
+
+
+@pytest.mark.parametrize("metric", [SMALL.metric, replace(BOUNDED, every="batch")], ids=["ramped", "learned"])
+def test_a_run_that_was_cut_and_resumed_gives_the_bits_and_the_log_of_an_uncut_one(train, metric):
+    settings = replace(SMALL, metric=metric)
+    whole = train("whole.h5", settings=settings)
+    for step in (3, 17, 29):
+        with pytest.raises(CutOffError):
+            train("cut.h5", settings=settings, watch=cut_at(step))
+    cut = train("cut.h5", settings=settings)
+    np.testing.assert_array_equal(cut.model.parameters, whole.model.parameters)
+    assert lines(cut.model) == lines(whole.model)
+    assert cut.model.training["best_step"] == whole.model.training["best_step"]
+    assert cut.score == whole.score
+
+
+def test_seeds_give_the_same_model_again_and_another_seed_another(train):
+    first, again = train("a.h5"), train("b.h5")
+    other = train("c.h5", settings=replace(SMALL, seed=1))
+    np.testing.assert_array_equal(first.model.parameters, again.model.parameters)
+    assert (first.model.parameters != other.model.parameters).any()
+
+
+def test_the_model_that_is_kept_is_the_best_of_those_that_were_validated(train):
+    trained = train()
+    checks = [record for record in lines(trained.model) if "validation" in record]
+    best = max(checks, key=lambda record: (record["validation"]["score"], record["step"]))
+    assert len(checks) == 10
+    assert trained.model.training["best_step"] == best["step"]
+
+
+def test_training_makes_plans_better(train):
+    trained = train(steps=300, settings=replace(SMALL, hidden=32))
+    steps = [record for record in lines(trained.model) if "loss" in record]
+    for name, share in (("joint-acceleration", 0.05), ("joint-torque", 0.05), ("table", 0.5)):
+        assert steps[-1]["terms"][name] < share * steps[0]["terms"][name]
+    assert trained.score["z_error_mm_s"] < 5
+
+
+def test_the_log_says_loss_terms_budgets_weights_and_rate_of_every_hundredth_and_is_in_the_model(train, tmp_path):
+    trained = train()
+    on_disk = (tmp_path / "model.jsonl").read_text()
+    assert trained.model.log == on_disk == load_model(trained.path).log
+    record = json.loads(on_disk.splitlines()[0])
+    assert {"step", "epoch", "learning_rate", "seconds", "loss", "terms", "weights", "budgets", "lost"} <= record.keys()
+    weighted = record["terms"]["time"] + sum(record["terms"][k] * w for k, w in record["weights"].items())
+    assert record["loss"] == pytest.approx(weighted)
+    assert not (tmp_path / "model.checkpoint").exists()
+
+
+def test_seconds_become_steps_before_the_run_begins(train):
+    begun = []
+    trained = train(steps=None, cpu_seconds=0.2, begin=lambda state, run: begun.append(state.steps))
+    assert begun == [trained.model.training["steps"]]
+    assert 10 < begun[0] < 2000
+
+
+def test_epochs_become_steps_too(train):
+    assert train(steps=None, epochs=2).model.training["steps"] == 2 * (600 // 32)
+
+
+def test_a_model_that_is_there_is_replaced_only_by_force(train):
+    train()
+    with pytest.raises(UsageError, match=r"model\.h5 exists already.*--force"):
+        train()
+    assert train(force=True).model.training["steps"] == STEPS
+
+
+def test_the_checkpoint_of_another_run_is_not_taken_for_this_one(train):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(5))
+    with pytest.raises(DatasetError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"):
+        train(settings=replace(SMALL, learning_rate=2e-3))
+    train(settings=replace(SMALL, learning_rate=2e-3), force=True)
+
+
+def test_a_damaged_checkpoint_is_an_error_and_no_other_model(train, tmp_path):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(5))
+    path = tmp_path / "model.checkpoint"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DatasetError, match=r"model\.checkpoint is damaged"):
+        train()
+
+
+def test_a_dataset_that_has_changed_since_is_not_trained_on_further(train, tmp_path):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(5))
+    other = tmp_path / "other"
+    make_dataset(tiny_recipe("airhockey-hit", seed=7), other, workers=1)
+    with pytest.raises(DatasetError, match=r"another run.*dataset\.(seed|fingerprint)"):
+        train_model(other, tmp_path / "model.h5", steps=STEPS, settings=SMALL, check_rows=2)
+
+
+def test_a_dataset_without_a_second_split_cannot_be_validated_on(tmp_path):
+    recipe = replace(tiny_recipe("airhockey-hit"), splits={"train": 64})
+    make_dataset(recipe, tmp_path / "one", workers=1)
+    with pytest.raises(DatasetError, match="another one to validate with"):
+        train_model(tmp_path / "one", tmp_path / "model.h5", steps=2, settings=SMALL)
+
+
+def test_a_killed_run_goes_on_where_its_checkpoint_was(train, tiny, tmp_path):
+    code = f"""
+from pathlib import Path
+from cnpgen.training import checkpoint
+from cnpgen.training.settings import TrainingSettings
+from cnpgen.training.train import train_model
+checkpoint.EVERY, checkpoint.SHARE = 0.0, 3.0
+train_model({str(tiny("airhockey-hit"))!r}, {str(tmp_path / "cut.h5")!r}, steps=600, check_rows=2, workers=1,
+    settings=TrainingSettings(hidden=16, layers=2, batch_size=32, nodes=16))
+"""
+    path, environment = tmp_path / "cut.checkpoint", {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment) as process:
+        deadline = time.monotonic() + 60
+        while not path.exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(0.3)
+        os.kill(process.pid, signal.SIGKILL)
+    assert path.exists()
+    begun = []
+    cut = train("cut.h5", steps=600, check_rows=2, begin=lambda state, run: begun.append(state.adam.step))
+    assert 0 < begun[0] < 600
+    np.testing.assert_array_equal(cut.model.parameters, train("whole.h5", steps=600, check_rows=2).model.parameters)
