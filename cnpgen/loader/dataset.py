@@ -25,7 +25,7 @@ from cnpgen.store.statistics import FieldStatistics
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """The rows of a dataset. Holds no open files: it can be pickled, forked and used by several threads.
+    """The rows of a dataset; it can be pickled, forked and used by several threads.
 
     In all methods ``fields`` are names in the order they are wanted in, by default all fields of numbers that are not
     diagnostics; ``normalize`` may be the :class:`Normalization` of another dataset; ``dtype`` is that of the fields of
