@@ -74,6 +74,21 @@ def test_pieces_of_a_block_are_its_rows_and_their_outcomes_add_up(prepared, whol
     assert_same_outcome(outcome, whole.outcome)
 
 
+def test_pieces_that_are_asked_for_together_are_those_asked_for_one_by_one(prepared, whole):
+    ranges = [(0, 1), (1, 64), (64, 1500), (1700, 1701), (3000, BLOCK_ROWS)]  # with gaps
+    drawn = []
+    run = PreparedPipeline._round
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PreparedPipeline, "_round", lambda *x: (drawn.append(x[2]), run(*x))[1])
+        together = list(prepared.pieces(SEED, "train", 0, ranges))
+    assert sum(drawn) < 1.3 * whole.outcome.tried + 300
+    assert len(together) == len(ranges)
+    for (first, stop), piece in zip(ranges, together, strict=True):
+        alone = prepared.block(SEED, "train", 0, first=first, stop=stop)
+        assert_same_columns(piece.columns, alone.columns)
+        assert_same_outcome(piece.outcome, alone.outcome)
+
+
 def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[int]]:
     """Rows that there are after each round of a block, and draws rejected at the end of each round."""
     sizes, tails = [], []

@@ -86,7 +86,8 @@ def write_shard(
     content = _encode(columns, fields, attributes, dtype)
     with committing(path, work) as temporary:
         temporary.write_bytes(content)
-        shapes = {name: info.shape for name, info in read_schema(temporary).items()}
+        with opened_hdf5(temporary) as file:
+            shapes = {name: item.shape for name, item in file.items()}
         if shapes != {field.name: _shape(field, rows) for field in fields}:
             raise DatasetError(f"{path} was not written as it was meant: found {shapes}")
     return len(content)
