@@ -23,6 +23,7 @@ NEEDED = {  # module -> the project on PyPI that has it
     "coal": "coal",
     "h5py": "h5py",
     "joblib": "joblib",
+    "psutil": "psutil",
     "tqdm": "tqdm",
 }
 OPTIONAL = {"matplotlib": "matplotlib"}

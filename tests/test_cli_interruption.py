@@ -17,6 +17,7 @@ from test_workers import alive
 import cnpgen
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible, raise_if_interrupted
 from cnpgen.cli.main import main
+from cnpgen.kernels.compiled import find_compiler
 
 KEPT = "finished shards are kept, run the same command again to go on"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.__file__).parents[1])}
@@ -102,6 +103,20 @@ def test_a_signal_to_all_processes_while_workers_start_gives_no_traceback(tmp_pa
         if seed == 0:
             os.killpg(process.pid, number)  # wrappers pass on what the terminal has sent already
         assert check_end(process, number, offspring) == ""
+
+
+@linux
+def test_workers_end_where_the_system_has_no_command_to_list_processes(tmp_path, monkeypatch):
+    """As in slim container images, where joblib alone fails to kill its workers."""
+    (tmp_path / "bin").mkdir()
+    if compiler := find_compiler():
+        (tmp_path / "bin" / "cc").symlink_to(compiler)
+    monkeypatch.setitem(ENVIRONMENT, "PATH", str(tmp_path / "bin"))
+    with making(tmp_path / "out", 2) as process:
+        wait_for(lambda: len(list(tmp_path.glob("out/train/*.json"))) >= 1)
+        offspring = descendants(process.pid)
+        process.send_signal(signal.SIGTERM)
+        check_end(process, signal.SIGTERM, offspring)
 
 
 @linux

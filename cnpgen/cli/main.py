@@ -195,6 +195,5 @@ def _warnings_on_one_line() -> Iterator[None]:
         print(f"cnpgen: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # joblib without pgrep; it kills them anyhow
         warnings.showwarning = show
         yield

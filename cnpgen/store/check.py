@@ -30,8 +30,8 @@ _NOTHING = "(nothing)"
 
 MAKE_AGAIN = "run the same make-dataset command again: it makes what is damaged or missing and keeps the rest"
 REPLACE = "nothing else says what the dataset was to be: make it again with --force"
-DELETE = "delete this shard and the .json beside it, then run the same make-dataset command again"
-REMOVE = "move it elsewhere"
+DELETE = "delete such a shard and the .json beside it, then run the same make-dataset command again"
+REMOVE = "move elsewhere what is not part of the dataset"
 
 
 @dataclass(frozen=True)
