@@ -131,7 +131,7 @@ def alive(pid: int) -> bool:
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
 def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, number):
     (tmp_path / "child.py").write_text(CHILD)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     command = [sys.executable, str(tmp_path / "child.py")]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
         workers = {int(child.stdout.readline()) for _ in range(2)}
