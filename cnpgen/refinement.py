@@ -26,7 +26,7 @@ from cnpgen.workers import share_out, worker_count
 FORMAT = "cnpgen-refinement"
 FORMAT_VERSION = 1
 ALONE = 60  # plans up to which a second process is not worth its start
-PART = 8  # plans that a process refines before it is given others
+PART = 1  # plans that a process refines before it is given others: what is finished is written down at once
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
@@ -77,6 +77,7 @@ def refine_plans(
     options: RefineOptions = DEFAULT,
     workers: int | None = None,
     journal: str | Path | None = None,
+    discard: bool = False,
     begin: Callable[[int, int], None] | None = None,
     progress: Progress | None = None,
 ) -> Refinement:
@@ -91,15 +92,16 @@ def refine_plans(
         options: How to refine.
         workers: Processes; default one per available core, or one where a second would not pay.
         journal: A file where finished plans are written down, and from which an interrupted run goes on.
+        discard: Whether what another run has written there may be thrown away.
         begin: Called once with the number of plans and of those that the journal holds.
         progress: Called with the numbers of plans finished and valid since the last call.
 
     Raises:
-        UsageError: An option makes no sense, or there are fewer than one worker.
+        UsageError: An option makes no sense, there are fewer than one worker, or the journal is another run's.
         RecipeError: The problem needs a plug-in that is not installed.
         MachineError: A worker died, or the journal cannot be written.
     """
-    notes = None if journal is None else open_journal(Path(journal), _identity(plans, options))
+    notes = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
     done: dict[int, Refined] = {} if notes is None else dict(notes.finished)
     if begin is not None:
         begin(len(plans), len(done))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 Array = NDArray[np.float64]
-SPLIT = "test"  # of fresh draws: no row of a training or validation split is among them
+SPLIT = "(fresh draws)"  # no split can be called so: no row of any dataset is among them
 
 
 def problems_of_rows(problem: ProblemRecord, columns: "Mapping[str, Array]") -> Plans:

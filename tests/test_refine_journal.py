@@ -1,12 +1,13 @@
 """The journal: whole frames count, damaged or foreign ones are as if they had never been written."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cnpgen.errors import MachineError
-from cnpgen.refine.journal import open_journal
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.refine.journal import MAGIC, open_journal
 from cnpgen.refine.task import Outcome, Refined
 
 IDENTITY = '{"run": "one"}'
@@ -68,10 +69,11 @@ def test_a_flipped_bit_ends_what_counts(tmp_path: Path) -> None:
     assert set(kept(path)) < set(range(6))
 
 
-@pytest.mark.parametrize("content", [b"", b"\0" * 7, b"\xff" * 4000])
-def test_files_that_are_no_journal_are_begun_anew(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize("length", [0, 7, len(MAGIC), len(MAGIC) + 20])
+def test_a_journal_that_was_cut_in_its_first_line_is_begun_anew(tmp_path: Path, length: int) -> None:
     path = tmp_path / "part"
-    path.write_bytes(content)
+    written(path, 0)
+    path.write_bytes(path.read_bytes()[:length])
     journal = open_journal(path, IDENTITY)
     assert journal.finished == {}
     journal.append([0], [refined(0)])
@@ -79,9 +81,31 @@ def test_files_that_are_no_journal_are_begun_anew(tmp_path: Path, content: bytes
     assert list(kept(path)) == [0]
 
 
-def test_the_journal_of_another_run_does_not_count(tmp_path: Path) -> None:
-    written(tmp_path / "part")
-    assert kept(tmp_path / "part", '{"run": "two"}') == {}
+def test_the_journal_of_another_run_is_kept_unless_it_may_be_thrown_away(tmp_path: Path) -> None:
+    path = tmp_path / "part"
+    written(path)
+    with pytest.raises(UsageError, match=r"part holds 6 finished plans of another run .* --force"):
+        open_journal(path, '{"run": "two"}')
+    assert len(kept(path)) == 6
+    open_journal(path, '{"run": "two"}', discard=True).close()
+    assert kept(path, '{"run": "two"}') == {}
+
+
+@pytest.mark.parametrize("content", [b"precious", b"\0" * 4000])
+def test_a_file_that_is_no_journal_is_not_touched(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "part"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="part is not a journal of cnpgen"):
+        open_journal(path, IDENTITY, discard=True)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such locks")
+def test_two_processes_do_not_share_a_journal(tmp_path: Path) -> None:
+    first = open_journal(tmp_path / "part", IDENTITY)
+    with pytest.raises(UsageError, match="part is in use"):
+        open_journal(tmp_path / "part", IDENTITY)
+    first.close()
     assert kept(tmp_path / "part") == {}
 
 

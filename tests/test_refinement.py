@@ -19,10 +19,11 @@ from cnpgen.make import make_dataset
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refinement import PART, refine_plans
+from cnpgen.refine.task import Outcome
+from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems, load_problems
 
-N = 2 * PART + 1
+N = 13
 
 
 @pytest.fixture(scope="module")
@@ -79,18 +80,34 @@ def test_an_interrupted_run_goes_on_where_it_was(problems: Plans, solved: Plans,
     with pytest.raises(KeyboardInterrupt):
         refine_plans(problems, workers=1, journal=journal, progress=stop)
     found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
-    assert begun == [(N, PART)]
+    assert begun == [(N, 1)]
     assert same(found.plans, solved)
-    refine_plans(
-        problems, workers=1, journal=journal, options=RefineOptions(tolerance=1e-3), begin=lambda *n: begun.append(n)
-    )
-    assert begun[-1] == (N, 0), "other options are another run"
+    with pytest.raises(UsageError, match="another run"):
+        refine_plans(problems, workers=1, journal=journal, options=RefineOptions(tolerance=1e-3))
 
 
 def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
-    found = refine_plans(solved, options=RefineOptions(max_iterations=0))
-    assert found.valid.all()
-    assert {each.iterations for each in found.refined} == {0}
+    assert refine_plans(solved, options=RefineOptions(max_iterations=0)).valid.all()
+    task = draw_problems("heavy-object", 1)
+    plan = refine_plans(task).plans
+    fast = replace(plan, rate_control_points=1.05 * plan.rate_control_points)
+    found = refine_plans(fast, options=RefineOptions(max_iterations=0))
+    assert [each.outcome for each in found.refined] == [Outcome.SLOWED]
+    np.testing.assert_allclose(found.plans.path_control_points, fast.path_control_points, atol=1e-12)
+    (nothing,) = refine_plans(task, options=RefineOptions(max_iterations=0)).refined
+    assert (nothing.valid, nothing.iterations) == (False, 0)
+
+
+def test_a_valid_plan_whose_rate_has_a_negative_control_point_is_no_worse_afterwards(tmp_path: Path) -> None:
+    plan = refine_plans(draw_problems("heavy-object", 1, seed=5)).plans
+    rate = 0.6 * plan.rate_control_points
+    rate[0, 4] = -0.005
+    given = replace(plan, rate_control_points=rate)
+    assert evaluate_plans(given).valid.all()
+    for options in (RefineOptions(max_iterations=0), RefineOptions()):
+        found = refine_plans(given, options=options)
+        assert found.valid.all()
+        assert found.plans.duration[0] <= given.duration[0] + 1e-9
 
 
 @pytest.mark.parametrize("objective", ["effort", "jerk"])
@@ -133,6 +150,17 @@ def test_solve_and_refine_write_files_that_evaluate_calls_valid(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans-refined.h5", "plans.h5"]
 
 
+def test_nothing_is_replaced_without_force(problems: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "plans.h5"
+    save_plans(file, problems.select(slice(0, 1)))
+    before = file.read_bytes()
+    assert main(["refine", str(file), "-o", str(file)]) == 2
+    assert "plans.h5 exists: --force replaces it" in capsys.readouterr().err
+    assert file.read_bytes() == before
+    assert main(["refine", str(file), "-o", str(file), "--force"]) == 0
+    assert load_plans(file).status.tolist() == [PlanStatus.VALID]
+
+
 def test_plans_without_success_are_named_and_the_exit_code_is_1(
     problems: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,6 +181,8 @@ def test_plans_without_success_are_named_and_the_exit_code_is_1(
         (["solve", "airhockey-hit", "--n", "2", "--split", "train"], "--split and --first are for the folder"),
         (["solve", "airhokey-hit", "--n", "2"], "did you mean 'airhockey-hit'"),
         (["refine", "nowhere.h5"], "nowhere.h5"),
+        (["solve", "airhockey-hit", "--n", "2", "-o", "."], "must be a file in a folder that exists"),
+        (["solve", "airhockey-hit", "--n", "2", "-o", "no/where.h5"], "must be a file in a folder that exists"),
         (["solve", "airhockey-hit", "--n", "2", "--tolerance", "2"], "tolerance must be between 0 and 1"),
         (["solve", "airhockey-hit", "--n", "2", "--weight", "-1"], "weight of an objective"),
     ],

@@ -21,8 +21,8 @@ LISTED = 10  # plans without success that are listed
 TEXT = """\
 Every plan is handled for itself: --workers and the order of the plans change nothing but the time. Pinocchio and Coal
 decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once: after Ctrl-C, kill -9
-or a full disk the same command goes on. The exit code is 0 if every plan is valid, and 1 if any is not; the file is
-written in either case. docs/refiner.md has the formulation.
+or a full disk the same command goes on. An existing OUT is replaced only with --force. The exit code is 0 if every
+plan is valid, and 1 if any is not; the file is written in either case. docs/refiner.md has the formulation.
 """
 
 
@@ -47,6 +47,7 @@ def add_options(parser: Parser) -> None:
         help="relative change of the objective at which a plan is finished (default: 2e-4)",
     )
     option("--step", metavar="S", type=values.seconds, default=1e-3, help="time between two looks (default: 1ms)")
+    option("--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part")
     option("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
 
@@ -67,6 +68,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
 
     names = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")
     options = RefineOptions(**{name: getattr(arguments, name) for name in names})
+    _check_place(out, force=arguments.force)
     journal = out.with_name(out.name + ".part")
     meter = Meter(quiet=arguments.quiet, noun="plan")
     finished = [0, 0]
@@ -83,6 +85,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
                 options=options,
                 workers=arguments.workers,
                 journal=journal,
+                discard=arguments.force,
                 begin=lambda total, there: meter.begin(title, total, there),
                 progress=progress,
             )
@@ -95,6 +98,16 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
     journal.unlink(missing_ok=True)
     _tell(arguments, found, out, meter.seconds)
     return 0 if found.valid.all() else 1
+
+
+def _check_place(out: Path, *, force: bool) -> None:
+    """Refuse before any work what would fail, or destroy something, after it."""
+    from cnpgen.errors import UsageError
+
+    if out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"{out} must be a file in a folder that exists")
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: --force replaces it, -o names another file")
 
 
 def _tell(arguments: argparse.Namespace, found: "Refinement", out: Path, seconds: float) -> None:

@@ -30,14 +30,14 @@ def add(commands: "Commands[Parser]") -> None:
     option("--split", metavar="NAME", help="which split of the folder (default: validation)")
     option("--first", metavar="I", type=values.natural, help="the first row of the split (default: 0)")
     option("--seed", metavar="S", type=values.seed, help="root seed of fresh draws; default the recipe's")
-    option("-o", "--out", metavar="OUT", type=Path, help="where to (default: NAME-plans.h5)")
+    option("-o", "--out", metavar="OUT", type=Path, help="where to (default: DIR-plans.h5 or NAME-plans.h5)")
     add_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     plans = _problems(arguments)
-    out = arguments.out or Path(f"{plans.problem.name}-plans.h5")
+    out = arguments.out or Path(f"{Path(arguments.what).stem}-plans.h5")
     return refine_and_save(arguments, plans, out, title=f"solving {arguments.what}")
 
 

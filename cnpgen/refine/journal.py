@@ -5,7 +5,6 @@ import io
 import json
 import os
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -13,9 +12,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError
+from cnpgen.errors import MachineError, UsageError
 from cnpgen.refine.task import Outcome, Refined
+from cnpgen.wording import counted
 
+MAGIC = b"cnpgen journal 1\n"
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -42,12 +43,9 @@ class Journal:
         """
         self._write(_pack(plans, refined))
 
-    def close(self, *, remove: bool = False) -> None:
-        """Close the file, and remove it when its content is where it belongs."""
+    def close(self) -> None:
+        """Close the file; others may open it again."""
         self._file.close()
-        if remove:
-            with suppress(OSError):
-                self.path.unlink()
 
     def _write(self, payload: bytes) -> None:
         try:
@@ -58,36 +56,74 @@ class Journal:
             raise MachineError(f"{self.path}: {error.strerror or error}; what is in it already counts") from error
 
 
-def open_journal(path: Path, identity: str) -> Journal:
+def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal:
     """Open the journal of a run, with what earlier runs of the same identity have finished.
 
     Args:
-        path: The file; it is made if it is missing, and emptied if it is of another run.
+        path: The file; it is made if it is missing.
         identity: What distinguishes the run: plans, options, version.
+        discard: Whether what another run has finished may be thrown away.
 
     Raises:
+        UsageError: The file is no journal, holds another run's plans, or is in use.
         MachineError: The file cannot be opened.
     """
     try:
         file = path.open("r+b" if path.exists() else "w+b")
     except OSError as error:
         raise MachineError(f"{path}: {error.strerror or error}") from error
-    frames, end = _read_frames(file)
+    try:
+        return _begin(path, file, identity, discard=discard)
+    except OSError as error:
+        file.close()
+        raise MachineError(f"{path}: {error.strerror or error}") from error
+    except BaseException:
+        file.close()
+        raise
+
+
+def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Journal:
+    """Read what is in the file and put the end where the next frame goes."""
+    _lock(path, file)
+    if not MAGIC.startswith(head := file.read(len(MAGIC))):
+        raise UsageError(f"{path} is not a journal of cnpgen: it must be removed, or another output be chosen")
+    frames, end = _read_frames(file) if head == MAGIC else ([], 0)
     journal = Journal(path, {}, file)
+    for frame in frames[1:]:
+        journal.finished |= _unpack(frame)
     if frames and frames[0] == identity.encode():
-        for frame in frames[1:]:
-            journal.finished |= _unpack(frame)
         file.truncate(end)
-    else:
-        file.seek(0)
-        file.truncate()
-        journal._write(identity.encode())
+        return journal
+    if journal.finished and not discard:
+        raise UsageError(
+            f"{path} holds {counted(len(journal.finished), 'finished plan')} of another run (other plans, options or"
+            " version): --force throws them away, another output keeps them"
+        )
+    journal.finished.clear()
+    file.seek(0)
+    file.truncate()
+    file.write(MAGIC)
+    journal._write(identity.encode())
     return journal
 
 
+def _lock(path: Path, file: IO[bytes]) -> None:
+    """Keep other processes from writing to the same journal, where the system can."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UsageError(f"{path} is in use: another process makes the same plans") from error
+    except OSError:  # file systems without locks
+        return
+
+
 def _read_frames(file: IO[bytes]) -> tuple[list[bytes], int]:
-    """Return the whole frames at the beginning of a file, and where they end."""
-    frames, end = [], 0
+    """Return the whole frames from here on, and where they end."""
+    frames, end = [], file.tell()
     while len(head := file.read(8 + _DIGEST)) == 8 + _DIGEST:
         payload = file.read(min(int.from_bytes(head[:8], "little"), 1 << 30))
         if hashlib.sha256(payload).digest() != head[8:]:

@@ -14,24 +14,72 @@ from cnpgen.verdict.verdict import Reason, Verdict
 Array = NDArray[np.float64]
 Judge = Callable[[Task, Array, Array], Verdict]  # of a task, path control points (C, n) and rate control points (R,)
 
+HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless there is no better one
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A plan with its verdict.
+
+    Attributes:
+        refined: The plan.
+        severity: 1 if it is valid; else how wrong it is, inf if it could not be evaluated.
+    """
+
+    refined: Refined
+    severity: float
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Violations first, then the objective."""
+        return self.severity, self.refined.cost
+
 
 @dataclass
 class _Search:
     """What was tried for one task.
 
     Attributes:
+        refiner: What makes attempts.
+        judge: Who decides.
         task: The task.
-        given: The plan that it came with, or None.
-        tried: Attempts, in order.
+        iterations: Steps of all attempts so far.
+        judged: Attempts with their verdicts.
+        hopeless: The others.
     """
 
+    refiner: Refiner
+    judge: Judge
     task: Task
-    given: Attempt | None
-    tried: list[Attempt] = field(default_factory=list)
+    iterations: int = 0
+    judged: list[_Candidate] = field(default_factory=list)
+    hopeless: list[Attempt] = field(default_factory=list)
 
-    @property
-    def iterations(self) -> int:
-        return sum(attempt.iterations for attempt in self.tried)
+    def offer(self, attempt: Attempt) -> bool:
+        """Take an attempt in; return whether it is valid."""
+        self.iterations += attempt.iterations
+        if attempt.excess > HOPELESS:
+            self.hopeless.append(attempt)
+            return False
+        self.judged.append(self._candidate(attempt))
+        return self.judged[-1].refined.valid
+
+    def best(self) -> _Candidate:
+        """Return the best attempt."""
+        if not self.judged:
+            self.judged.append(self._candidate(min(self.hopeless, key=lambda each: (each.excess, each.cost))))
+        return min(self.judged, key=lambda each: each.rank)
+
+    def weigh(self, path: Array, rate: Array, outcome: Outcome) -> _Candidate:
+        """Judge a plan."""
+        verdict = self.judge(self.task, path, rate)
+        cost = self.refiner.check.transcription(self.task).objective(path, rate)
+        reached = outcome if verdict.valid or outcome is Outcome.KEPT else Outcome.UNSOLVED
+        return _Candidate(Refined(path, rate, reached, verdict.reason, 0, cost), _severity(verdict))
+
+    def _candidate(self, attempt: Attempt) -> _Candidate:
+        path, rate = self.refiner.check.transcription(self.task).unpack(attempt.x)
+        return self.weigh(path, rate, attempt.outcome)
 
 
 def refine_task(refiner: Refiner, judge: Judge, task: Task) -> Refined:
@@ -44,37 +92,25 @@ def refine_task(refiner: Refiner, judge: Judge, task: Task) -> Refined:
     """
     if not task.is_finite:
         return _unusable(refiner, task)
-    motion, search = refiner.check.transcription(task), _Search(task, refiner.given(task))
-    for attempt in refiner.attempts(task, search.given):
-        search.tried.append(attempt)
-        if attempt.excess <= 1 and judge(task, *motion.unpack(attempt.x)).valid:
+    search, given = _Search(refiner, judge, task), refiner.given(task)
+    for attempt in refiner.attempts(task, given):
+        if search.offer(attempt):
             break
-    else:
-        return _best(refiner, judge, search)
-    given = search.given
-    if given is not None and given.excess <= 1 and given.cost <= attempt.cost:
-        path, rate = motion.unpack(given.x)
-        if judge(task, path, rate).valid:
-            return Refined(path, rate, Outcome.KEPT, Reason.OK, search.iterations, given.cost)
-    path, rate = motion.unpack(attempt.x)
-    return Refined(path, rate, attempt.outcome, Reason.OK, search.iterations, attempt.cost)
+    best = search.best()
+    for path, rate in _as_given(refiner, task, given):
+        if not best.refined.valid or refiner.check.transcription(task).objective(path, rate) <= best.refined.cost:
+            kept = search.weigh(path, rate, Outcome.KEPT)
+            best = min(best, kept, key=lambda each: each.rank)
+    return Refined(**{**vars(best.refined), "iterations": search.iterations})
 
 
-def _best(refiner: Refiner, judge: Judge, search: _Search) -> Refined:
-    """Return the best of what is not valid: what the verdict finds least wrong with, the given plan among it."""
-    task, motion = search.task, refiner.check.transcription(search.task)
-    attempt = min(search.tried, key=lambda each: (max(each.excess, 1.0), each.cost))
-    candidates = [(*motion.unpack(attempt.x), Outcome.UNSOLVED, attempt.cost)]
-    if search.given is not None:
-        assert task.path is not None
-        assert task.rate is not None
-        exact = motion.unpack(search.given.x)
-        candidates += [(*plan, Outcome.KEPT, search.given.cost) for plan in (exact, (task.path, task.rate))]
-    verdicts = [judge(task, path, rate) for path, rate, *_ in candidates]
-    order = [(_severity(verdict), cost) for verdict, (*_, cost) in zip(verdicts, candidates, strict=True)]
-    chosen = order.index(min(order))
-    path, rate, outcome, cost = candidates[chosen]
-    return Refined(path, rate, outcome, verdicts[chosen].reason, search.iterations, cost)
+def _as_given(refiner: Refiner, task: Task, given: Attempt | None) -> list[tuple[Array, Array]]:
+    """Return the plan as it was given, where it can be evaluated: with exact ends, and as it is."""
+    plans = [] if given is None else [refiner.check.transcription(task).unpack(given.x)]
+    if task.path is not None and task.rate is not None and np.isfinite(task.path).all():
+        forward = Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]
+        plans += [(task.path, task.rate)] if forward else []
+    return plans
 
 
 def _severity(verdict: Verdict) -> float:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from cnpgen.verify.world import World
 
 Array = NDArray[np.float64]
+LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 
 
@@ -94,7 +95,7 @@ class Refiner:
         settings: Settings = DEFAULT,
         solver: str = "own",
     ) -> None:
-        self.problem, self.robot = problem, robot
+        self.problem, self.robot, self.settings = problem, robot, settings
         self._minimise = minimise if solver == "own" else partial(minimise_with, solver=solver)
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
@@ -115,12 +116,15 @@ class Refiner:
         return (self.robot.position_lower + self.robot.position_upper) / 2
 
     def given(self, task: Task) -> Attempt | None:
-        """Return the plan of the task with exact boundary control points, or None where there is no usable one."""
-        if task.path is None or task.rate is None or not np.isfinite(task.path).all() or not np.all(task.rate > 0):
+        """Return the plan of the task with exact boundary control points, or None where there is no usable one.
+
+        Rate control points that are not positive, though r may be, are raised: the variables are logarithms.
+        """
+        if task.path is None or task.rate is None or not np.isfinite(task.path).all():
             return None
-        if not np.isfinite(task.rate).all():
+        if not np.isfinite(task.rate).all() or not np.any(task.rate > 0):
             return None
-        x = self.check.transcription(task).pack(task.path, task.rate)
+        x = self.check.transcription(task).pack(task.path, np.maximum(task.rate, LOWEST_RATE * task.rate.max()))
         cost, excess = self.check.measure(task, x)
         return Attempt(x, excess.worst, cost, Outcome.KEPT)
 
@@ -131,14 +135,20 @@ class Refiner:
             task: What to plan; its boundary conditions are numbers.
             given: What ``given`` says of it.
         """
-        straight = starts.straight(task.boundary, self.robot.velocity_limit, self.spec)
-        first = given.x if given is not None and given.excess < np.inf else _variables(straight)
-        best = self._attempt(task, self.passes.first, first, Outcome.SOLVED, warm=given is not None)
+        repaired = self._slowed(task, given) if given is not None and given.excess > 1 and task.at_rest else given
+        if self.settings.max_iterations == 0:
+            yield repaired if repaired is not None else self._measured(task, self._straight(task))
+            return
+        usable = repaired is not None and repaired.excess < np.inf
+        x = repaired.x if repaired is not None and usable else self._straight(task)
+        best = self._attempt(task, self.passes.first, x, Outcome.SOLVED, warm=usable)
         if best.excess > 1 and task.at_rest:
             best = self._slowed(task, best)
         yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
         yield polished
+        if repaired is not None and repaired.outcome is Outcome.SLOWED and repaired.excess <= 1:
+            yield repaired
         best = polished if polished.is_better(best) else best
         yield self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED, warm=True)
         for start in self._other_starts(task):
@@ -154,6 +164,13 @@ class Refiner:
     def transcription(self, task: Task, which: Pass) -> Transcription:
         """Return the motion on the grid of a pass."""
         return Transcription(self.stage, self._grids[which.points], boundary=task.boundary, tops=task.tops)
+
+    def _straight(self, task: Task) -> Array:
+        return _variables(starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
+
+    def _measured(self, task: Task, x: Array) -> Attempt:
+        cost, excess = self.check.measure(task, x)
+        return Attempt(x, excess.worst, cost, Outcome.UNSOLVED)
 
     def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, *, warm: bool = False) -> Attempt:
         result = self.minimise(task, which, x, warm=warm)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 DISTANCE = 0.1  # m
+TOLERANCES = 20
 
 
 def stage_values(robot: "Robot", problem: Problem) -> Any:
@@ -51,7 +52,10 @@ def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
 
 
 def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> Array:
-    """Natural size of residuals: the limit itself, twice the tolerance of an equality, 0.1 m of a distance."""
+    """Natural size of residuals: the limit itself, 20 tolerances of an equality, 0.1 m of a distance.
+
+    With fewer tolerances the merit function holds steps back for the sake of equalities that are met well enough.
+    """
     if kind == "limit":
         return np.maximum(np.abs(lower), np.abs(upper))
-    return np.where(lower == upper, 20 * tolerance, DISTANCE)
+    return np.where(lower == upper, TOLERANCES * tolerance, DISTANCE)

@@ -1,9 +1,9 @@
 """The optimisation problem of one motion: variables, residuals on a Chebyshev grid, and their derivatives.
 
 Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
-by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix A).
-Residuals are the problem's constraints, each divided by a natural size (a limit by itself, an equality by its
-tolerance), so that a violation of 1e-3 means the same everywhere.
+by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix
+A). Residuals are the problem's constraints, each divided by a natural size (``cnpgen.refine.stage``), so that a
+violation of 1e-3 means about the same everywhere.
 """
 
 from dataclasses import dataclass
@@ -106,6 +106,16 @@ class Transcription:
         if self.stage.criterion is not None:
             cost += self._criterion(path, rate)
         return float(cost), g.T
+
+    def objective(self, path: Array, rate: Array) -> float:
+        """Return the objective of a motion [s]: its duration and the criterion, without what fixes the gauge.
+
+        Args:
+            path: Path control points [rad], shape (C, n).
+            rate: Rate control points [1/s], shape (R,).
+        """
+        duration = float(self.grid.weights @ (1.0 / (self.grid.gauss @ rate)))
+        return duration + (0.0 if self.stage.criterion is None else self._criterion(path, rate))
 
     def evaluate(self, x: Array) -> Evaluation:
         """Evaluate objective and residuals with their derivatives."""
