@@ -37,10 +37,12 @@ def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Set
     best.offer(x)
     try:
         found = function(x0=x, lbg=model.lower, ubg=model.upper)
-        best.offer(np.asarray(found["x"], float).ravel())
-        iterations = int(function.stats()["iter_count"])
     except RuntimeError:  # a plug-in that stops on numbers that it cannot bear: what it began with is still there
-        iterations = 0
+        found = {"x": ca.DM(x)}
+    if model.interruption is not None:
+        raise model.interruption
+    best.offer(np.asarray(found["x"], float).ravel())
+    iterations = int(function.stats().get("iter_count", 0))
     at, violation = best.found
     return Result(at.x, at.cost, violation, iterations, violation <= settings.violation_tolerance)
 
@@ -50,9 +52,11 @@ class _Model:
 
     def __init__(self, motion: Transcription, bounds: Bounds, x: Array) -> None:
         self.motion, self.bounds = motion, bounds
+        self.kept: list[Any] = []  # CasADi does not keep its callbacks alive
         self._k, self._which = np.nonzero(np.isfinite(bounds.lower) | np.isfinite(bounds.upper))
         self.lower, self.upper = bounds.lower[self._k, self._which], bounds.upper[self._k, self._which]
         self._last: Evaluation | None = None
+        self.interruption: BaseException | None = None  # CasADi drops what is raised in its callbacks
         near = x + 0.01 * np.sin(np.arange(len(x)))  # nowhere special: what is zero here, too, is zero everywhere
         self.row, self.column = np.nonzero((self._dense(x) != 0) | (self._dense(near) != 0))
         order = np.lexsort((self.row, self.column))  # CasADi stores columns
@@ -91,11 +95,14 @@ class _Best:
             self.found = at, violation
 
 
-def _wrap(ca: Any, name: str, inputs: list[Any], output: Any, compute: Any, slope: Any = None) -> Any:
+def _wrap(  # noqa: PLR0917
+    ca: Any, model: _Model, name: str, inputs: list[Any], output: Any, compute: Any, slope: Any = None
+) -> Any:
     """Wrap a NumPy function of x as a CasADi function.
 
     Args:
         ca: CasADi.
+        model: What keeps the function alive, and what is raised in it.
         name: Name of the function.
         inputs: Sparsity patterns of its arguments; the first is x, the others are ignored.
         output: Sparsity pattern of its result.
@@ -127,9 +134,14 @@ def _wrap(ca: Any, name: str, inputs: list[Any], output: Any, compute: Any, slop
             return slope
 
         def eval(self, arguments: list[Any]) -> list[Any]:
-            return [ca.DM(output, compute(np.asarray(arguments[0], float).ravel()))]
+            try:
+                return [ca.DM(output, compute(np.asarray(arguments[0], float).ravel()))]
+            except BaseException as error:
+                model.interruption = error
+                raise
 
-    return Wrapped()
+    model.kept.append(Wrapped())
+    return model.kept[-1]
 
 
 def _callbacks(ca: Any, model: _Model) -> tuple[Any, Any]:
@@ -137,21 +149,19 @@ def _callbacks(ca: Any, model: _Model) -> tuple[Any, Any]:
     nx, m, dense = model.motion.nx, len(model.lower), ca.Sparsity.dense
     x, one, many = dense(nx, 1), dense(1, 1), dense(m, 1)
     pattern = ca.Sparsity.triplet(m, nx, model.row.tolist(), model.column.tolist())
-    gradient = _wrap(ca, "gradient", [x, one], dense(1, nx), lambda at: model.at(at).gradient)
-    jacobian = _wrap(ca, "jacobian", [x, many], pattern, model.jacobian)
-    value = _wrap(ca, "value", [x], one, lambda at: model.at(at).cost, gradient)
-    return value, _wrap(ca, "constraints", [x], many, model.residuals, jacobian)
+    gradient = _wrap(ca, model, "gradient", [x, one], dense(1, nx), lambda at: model.at(at).gradient)
+    jacobian = _wrap(ca, model, "jacobian", [x, many], pattern, model.jacobian)
+    value = _wrap(ca, model, "value", [x], one, lambda at: model.at(at).cost, gradient)
+    return value, _wrap(ca, model, "constraints", [x], many, model.residuals, jacobian)
 
 
 def _curvature(ca: Any, model: _Model, proximal: float) -> Any:
     """Wrap the Gauss-Newton Hessian in the place of the Lagrangian's."""
     nx, m, dense = model.motion.nx, len(model.lower), ca.Sparsity.dense
     inputs = [dense(nx, 1), ca.Sparsity(0, 0), dense(1, 1), dense(m, 1)]
-    upper = ca.Sparsity.upper(nx)
-    rows, columns = (np.array(each) for each in upper.get_triplet())
-    hessian = _wrap(ca, "hessian", inputs, upper, lambda x: model.curvature(x, proximal)[rows, columns])
+    hessian = _wrap(ca, model, "hessian", inputs, dense(nx, nx), lambda x: model.curvature(x, proximal).ravel())
     x, p, f, g = ca.MX.sym("x", nx), ca.MX.sym("p", 0, 0), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
-    names = (["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"])
+    names = (["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"])
     return ca.Function("nlp_hess_l", [x, p, f, g], [hessian(x, p, f, g)], *names)
 
 
