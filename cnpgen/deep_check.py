@@ -20,6 +20,7 @@ from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.verify.report import RowReport, merge
 from cnpgen.verify.rows import verify_rows
+from cnpgen.wording import counted
 from cnpgen.workers import share_out
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
@@ -52,7 +53,7 @@ def check_rows(
     every = np.concatenate(keys)
     twice = len(every) - len(np.unique(every))
     if twice:
-        findings.append(Finding("(all splits)", f"{twice} rows stand in the dataset more than once"))
+        findings.append(Finding("(all splits)", f"{counted(twice, 'row')} that stand in the dataset before, too"))
     return merge(reports) if reports else None, findings
 
 
@@ -85,7 +86,7 @@ def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardChe
         problems = check_plans(problem, robot, columns)
     problems += check_numbers(plan, task, columns, record)
     problems += [
-        f"{check.name}: {check.rows_out} rows out, worst {check.worst:.3g} {check.unit}"
+        f"{check.name}: {counted(check.rows_out, 'row')} out, worst {check.worst:.3g} {check.unit}"
         f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}"
         for check in report.failed
     ]

@@ -69,7 +69,7 @@ class ValidationReport:
             )
             lines += [
                 f"    {check.name:<22} worst {check.worst:9.2e} of {check.allowed:9.2e} {check.unit:<8}"
-                f" {check.rows_out} rows out"
+                f" {counted(check.rows_out, 'row')} out"
                 for check in self.deep.checks
             ]
         if self.regenerated:

@@ -248,7 +248,7 @@ def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(tiny: Tiny, tm
     assert set(named(report)) == {"train/shard-00001.h5"}
     found = [finding.problem for finding in report.findings]
     row = TINY_SHARD + 17
-    assert any(problem.startswith(f"{check}: 1 rows out") and f"in row {row}" in problem for problem in found), found
+    assert any(problem.startswith(f"{check}: 1 row out") and f"in row {row}" in problem for problem in found), found
     assert report.deep is not None
     assert report.deep.out.tolist() == [row]
 
@@ -263,7 +263,7 @@ def put_nan(column: str) -> Callable[[h5py.File], None]:
 def test_deep_names_numbers_that_are_none(damaged: Path):
     edit(damaged, "train/shard-00000.h5", put_nan("goal_q"))
     report = validate_dataset(damaged, deep=True, workers=1)
-    assert any("finite: 1 rows out" in finding.problem for finding in report.findings)
+    assert any("finite: 1 row out" in finding.problem for finding in report.findings)
 
 
 def test_a_field_that_is_gone_is_a_finding_of_the_deep_check_too(damaged: Path):

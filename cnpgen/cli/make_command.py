@@ -28,7 +28,7 @@ counted under "no plan found", and the plan's control points are stored beside t
 The folder of the dataset is printed on stdout.
 
 What is in the folder already is kept if it is of the same dataset: its shards are read and compared with their
-recorded sha256 (about 300 MB/s per core), and damaged ones are made again. Another dataset is replaced only with
+recorded sha256 (at 0.3 to 1 GB/s per core), and damaged ones are made again. Another dataset is replaced only with
 --force, or if it has no rows yet. After Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command
 goes on.
 """
