@@ -280,7 +280,8 @@ def test_a_damaged_shard_is_a_warning_of_one_line(run, hits, tmp_path):
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
     code, out, err = run(*MAKE, tmp_path / "hits", "--dry-run", "--dtype", "float32")
-    assert (code, err) == (0, "")
+    assert code == 0
+    assert err in {"", "cnpgen: compiling kernels, once per machine\n"}
     for text in ("state    new", "200: train 182, validation 18", "float32", "rad/s^2", "start_ddq", "bytes per row"):
         assert text in out
     assert list(tmp_path.iterdir()) == []
