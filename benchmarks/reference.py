@@ -33,8 +33,7 @@ from pinocchio_scipy import (
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import BLOCK_ROWS
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stage import BLOCK_ROWS, Batch
 
 LOSS = 1e-6  # an objective this much below the reference's is a defeat
 
