@@ -112,14 +112,14 @@ def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
             for pid in killed:
                 os.kill(pid, signal.SIGKILL)
 
-    recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 60_000, "validation": 5000})
-    folder, options = tmp_path / "out", {"shard_size": 1000, "workers": 2}
+    recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24_000, "validation": 2000})
+    folder = tmp_path / "out"
     with pytest.raises(MachineError, match=r"a worker died .*finished are safe in .*run the same command again"):
-        make_dataset(recipe, folder, **options, progress=kill)
+        make_dataset(recipe, folder, shard_size=1000, workers=2, progress=kill)
     assert len(killed) == 2
-    assert 1 <= len(digests(folder)) < 65
-    assert make_dataset(recipe, folder, **options).complete
-    make_dataset(recipe, tmp_path / "uncut", **options)
+    assert 1 <= len(digests(folder)) < 26
+    assert make_dataset(recipe, folder, workers=1).complete
+    make_dataset(recipe, tmp_path / "uncut", shard_size=1000, workers=1)
     assert digests(folder) == digests(tmp_path / "uncut")
 
 
