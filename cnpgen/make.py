@@ -14,6 +14,7 @@ from cnpgen.library import load_dataset_recipe
 from cnpgen.make_plan import dataset_folder, plan_dataset
 from cnpgen.make_shard import Job, make_shards
 from cnpgen.outcome import Outcome
+from cnpgen.pipelines.stage import BLOCK_ROWS
 from cnpgen.recipes import DatasetRecipe
 from cnpgen.store.check import check_documents
 from cnpgen.store.layout import MANIFEST
@@ -157,9 +158,7 @@ def _take_stock(
 
 def _make(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Outcome], None, None]:
     """Make the shards and yield what became of them as they are committed."""
-    if workers is None and sum(task.rows for task in tasks) <= ALONE[job.backend]:
-        workers = 1
-    workers = worker_count(workers, len(tasks))
+    workers = worker_count(1 if workers is None and is_quick(job.plan, tasks) else workers, len(tasks))
     groups = runs(job.plan, tasks, workers)
     if workers == 1:
         for group in groups:
@@ -174,6 +173,11 @@ def _make(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tu
 def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Outcome]]:
     """Make the shards of a run; what a worker does."""
     return list(make_shards(job, tasks))
+
+
+def is_quick(plan: DatasetPlan, tasks: list[ShardTask]) -> bool:
+    """Whether one process makes the shards before a second one would have started; small blocks mean slow rows."""
+    return plan.block_rows >= BLOCK_ROWS and sum(task.rows for task in tasks) <= ALONE[plan.backend]
 
 
 def runs(plan: DatasetPlan, tasks: list[ShardTask], workers: int) -> list[list[ShardTask]]:

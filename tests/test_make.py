@@ -17,7 +17,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import load_dataset_recipe
 from cnpgen.make import _part as make_part
-from cnpgen.make import make_dataset, runs
+from cnpgen.make import is_quick, make_dataset, runs
 from cnpgen.make_plan import plan_dataset
 from cnpgen.make_shard import Job, make_shards, shard_columns
 from cnpgen.outcome import Outcome
@@ -256,6 +256,15 @@ def test_small_shards_have_the_rows_and_counts_of_large_ones(large, tmp_path):
             np.testing.assert_array_equal(found[name], values, err_msg=name)
     one, other = (load_manifest(folder)["yield"] for folder in (large, tmp_path / "small"))
     assert one == other
+
+
+def test_a_second_process_is_started_for_many_rows_or_slow_ones_only(job):
+    plan = replace(job.plan, backend="compiled", splits={"train": 200_000})
+    assert is_quick(plan, shards(plan))
+    assert not is_quick(replace(plan, backend="numpy"), shards(plan))
+    assert not is_quick(replace(plan, block_rows=64), shards(plan)[:1])
+    more = replace(plan, splits={"train": 200_001})
+    assert not is_quick(more, shards(more))
 
 
 @pytest.mark.parametrize("size", [64, 1000, 4096, 5000, 8192, 100_000])
