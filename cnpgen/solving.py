@@ -1,7 +1,8 @@
 """Problems to solve: rows of a dataset, or fresh draws of a recipe, as plans that are still to be made."""
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from cnpgen.store.plan import DatasetPlan
 
 Array = NDArray[np.float64]
 SPLIT = "(fresh draws)"  # no split can be called so: no row of any dataset is among them
@@ -64,7 +67,8 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
     rows = dataset.plan.splits[split]
     stop = rows if n is None else start + n
     if not 0 <= start < stop <= rows:
-        raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {start} to {stop - 1}")
+        wanted = f"{stop - start} from row {start} on"
+        raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}")
     return problems_of_rows(_problem_of(dataset.plan), dataset.read(split, start=start, stop=stop))
 
 
@@ -101,8 +105,6 @@ def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | Non
     return problems_of_rows(record_problem(loaded.pipeline.problem), columns)
 
 
-def _problem_of(plan: Any) -> ProblemRecord:
+def _problem_of(plan: "DatasetPlan") -> ProblemRecord:
     """Return the problem that a dataset was made for."""
-    import json
-
     return ProblemRecord(json.dumps(plan.recipe["pipeline"]["problem"], ensure_ascii=False), plan.robot["urdf"])

@@ -44,7 +44,7 @@ def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Set
     best.offer(np.asarray(found["x"], float).ravel())
     iterations = int(function.stats().get("iter_count", 0))
     at, violation = best.found
-    return Result(at.x, at.cost, violation, iterations, violation <= settings.violation_tolerance)
+    return Result(at.x, at.cost, violation, iterations)
 
 
 class _Model:

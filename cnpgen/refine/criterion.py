@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Kind = Literal["centrifugal", "effort", "jerk"]
 
-OBJECTIVES = ("time", "effort", "jerk")
+OBJECTIVES: dict[str, Kind] = {"time": "centrifugal", "effort": "effort", "jerk": "jerk"}
 ROUNDED = 0.5  # m/s^2: below, the centrifugal acceleration counts quadratically, so that its gradient is continuous
 SLOW = 1e-4  # m^2/s^2: keeps the direction of a tip at rest defined
 
@@ -60,7 +60,7 @@ def choose_criterion(problem: Problem, objective: str = "time", weight: float | 
         objective: One of ``OBJECTIVES``; "time" is the problem's own objective: time and centrifugal acceleration.
         weight: Weight of the term; by default the problem's for the centrifugal acceleration and 1 for the others.
     """
-    kind: Kind = "centrifugal" if objective == "time" else "effort" if objective == "effort" else "jerk"
+    kind = OBJECTIVES[objective]
     default = problem.objective.centrifugal if kind == "centrifugal" else 1.0
     chosen = default if weight is None else weight
     return Criterion(kind, chosen) if chosen > 0 else None

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.refine.criterion import OBJECTIVES
+from cnpgen.verdict.judge import check_step
 
 SOLVERS = ("own", "ipopt", "sqpmethod")
 
@@ -42,6 +43,7 @@ class RefineOptions:
             raise UsageError(f"the weight of an objective must be a number that is not negative, got {self.weight}")
         if self.max_iterations is not None and self.max_iterations < 0:
             raise UsageError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_step(self.step)
         if not 0 < self.tolerance < 1:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
 

@@ -80,14 +80,12 @@ class Result:
         cost: Objective there.
         violation: Worst scaled violation there.
         iterations: Steps tried.
-        converged: Whether it stopped because nothing changed any more.
     """
 
     x: Array
     cost: float
     violation: float
     iterations: int
-    converged: bool
 
 
 def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings) -> Result:
@@ -106,7 +104,6 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
     violation = bounds.violation(at.g)
     multipliers: Array | None = None
     extra = np.zeros(at.g.shape, bool)
-    converged = False
     iteration = 0
     for iteration in range(1, settings.max_iterations + 1):
         near = 0.4 if length > 0.2 else 0.2 if length > 0.05 else 0.1
@@ -135,7 +132,7 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
                 radius *= 0.5
             done = change < settings.cost_tolerance * cost and new_violation < settings.violation_tolerance
             if done:
-                return Result(at.x + dx, cost, new_violation, iteration, True)
+                return Result(at.x + dx, cost, new_violation, iteration)
             at = motion.evaluate(at.x + dx)
             violation = new_violation
             extra[:] = False
@@ -146,7 +143,7 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
                 radius = 0.35 * min(radius, size)
         if radius < 1e-5:
             break
-    return Result(at.x, at.cost, violation, iteration, converged)
+    return Result(at.x, at.cost, violation, iteration)
 
 
 def _indices(held: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
