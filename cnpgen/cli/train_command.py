@@ -46,7 +46,7 @@ def add(commands: "Commands[Parser]") -> None:
     )
     option("--seed", metavar="S", type=values.seed, help="of the first parameters and the order of rows (default: 0)")
     option("--check", metavar="N", type=values.positive, default=200, help="rows to validate on (default: 200)")
-    option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on all rows")
+    option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
     option("--force", action="store_true", help="begin again, and replace what is there")
     option("--quiet", action="store_true", help="no progress and no summary")
 

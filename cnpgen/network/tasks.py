@@ -66,5 +66,6 @@ def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
     Returns:
         Shape (N,).
     """
-    needed: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
-    return np.maximum(needed.max(axis=1), SHORTEST_TIME)
+    each: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
+    time: Array = np.maximum(each.max(axis=1), SHORTEST_TIME)
+    return time

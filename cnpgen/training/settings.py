@@ -7,7 +7,7 @@ from cnpgen.losses.schedule import BOUNDED, PUBLISHED, MetricSettings
 
 METRICS = {
     "fixed": MetricSettings(kind="fixed"),
-    "ramped": MetricSettings(kind="ramped", growth=30.0, ramp=(0.1, 0.95)),
+    "ramped": MetricSettings(kind="ramped"),
     "learned": PUBLISHED,
     "bounded": BOUNDED,
 }

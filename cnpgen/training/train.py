@@ -32,6 +32,7 @@ from cnpgen.training.step import Learner
 from cnpgen.training.validation import validate
 
 SECONDS = 120.0  # of CPU time, if nobody says how long
+MOST_JUDGED = 2000  # validation rows that the last model is judged on
 WARMING, TIMED = 10, 50  # steps taken to find out how long one takes
 
 
@@ -42,7 +43,7 @@ class Trained:
     Attributes:
         model: The best model.
         path: Its file.
-        score: What ``validate`` says of it on the whole validation split.
+        score: What ``validate`` says of it on the validation split, or its first 2,000 rows.
     """
 
     model: Model
@@ -78,7 +79,7 @@ def train_model(
         cpu_seconds: How long, in CPU time of the steps [s]: how long a step takes is measured before, and their number
             is then fixed. If nothing says how long, 120 s.
         settings: How to train.
-        check_rows: Validation rows that models are compared by on the way; the last one sees all of them.
+        check_rows: Validation rows that models are compared by on the way; the last one sees up to 2,000.
         command: What the model says that it was made by.
         force: Begin again, and replace what is there.
         workers: Processes of the last validation; training itself is one process.
@@ -101,14 +102,15 @@ def train_model(
     elif out.exists() and not checkpoints.path.exists():
         raise UsageError(f"{out} exists already: train another one, or pass --force to replace it")
     with one_thread(), surroundings(problem_of(source.dataset.plan)) as given:
-        run, kit = _prepare(source, given, settings, check_rows, command)
-        state = checkpoints.load() or _begin(run, length)
+        run, kit = prepare_run(source, given, settings, check_rows=check_rows, command=command)
+        state = checkpoints.load() or begin_run(run, length)
         if begin is not None:
             begin(state, run)
         journal = Journal(out.with_suffix(".jsonl"), state.adam.step)
         run.go_on(state, checkpoints, journal, watch)
         checkpoints.save(state)
-        score = validate(run.model(state.best.parameters), kit, source.boundary(source.validation), workers=workers)
+        held_out = source.boundary(source.validation, MOST_JUDGED)
+        score = validate(run.model(state.best.parameters), kit, held_out, workers=workers)
     journal.write({"step": state.adam.step, "best": state.best.step, "final": score})
     model = run.model(state.best.parameters, log=journal.text, training=_outcome(state, score))
     save_model(out, model)
@@ -116,17 +118,27 @@ def train_model(
     return Trained(model, out, score)
 
 
-def _prepare(
-    source: Source, given: Surroundings, settings: TrainingSettings, check_rows: int, command: str
+def prepare_run(
+    source: Source, given: Surroundings, settings: TrainingSettings, *, check_rows: int = 200, command: str = ""
 ) -> tuple[Run, Kit]:
-    """Load rows, kernels and loss; set up the network."""
+    """Load rows, kernels and loss; set up the network.
+
+    Args:
+        source: The dataset.
+        given: Its problem.
+        settings: How to train.
+        check_rows: Validation rows that models are compared by.
+        command: What the model says that it was made by.
+
+    Returns:
+        The run, and the kit that plans are made with.
+    """
     boundary = source.boundary(source.train)
     rest = resting(boundary)
     kit = make_kit(given, bending_steps=settings.bending_steps, slow_down=len(rest) == 3)  # all of them
     rows, features = prepare_rows(boundary, kit.prepare)
     spec, joints = given.problem.trajectory, given.robot.n
-    loss = PlanLoss(given.problem, nodes=settings.nodes)
-    loss = PlanLoss(given.problem, nodes=settings.nodes, margins=suggested_margins(loss.terms))
+    loss = _loss(given, settings)
     architecture = Architecture(
         inputs=rows.features.shape[1],
         hidden=settings.hidden,
@@ -157,6 +169,12 @@ def _prepare(
     return run, kit
 
 
+def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
+    backend = given.kernels.backend
+    names = PlanLoss(given.problem, nodes=settings.nodes, backend=backend).terms  # its kernels are built when needed
+    return PlanLoss(given.problem, nodes=settings.nodes, backend=backend, margins=suggested_margins(names))
+
+
 def _identity(source: Source, settings: TrainingSettings, length: Length, check_rows: int) -> dict[str, Any]:
     """Say what distinguishes one run from another."""
     lasts = {name: value for name, value in vars(length).items() if value is not None}
@@ -169,7 +187,7 @@ def _identity(source: Source, settings: TrainingSettings, length: Length, check_
     }
 
 
-def _begin(run: Run, length: Length) -> State:
+def begin_run(run: Run, length: Length) -> State:
     """Start a run; find out how many steps it has."""
     if length.steps is not None:
         steps = length.steps

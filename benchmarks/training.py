@@ -1,0 +1,164 @@
+"""A training step, everything included, and what a run of some CPU time reaches.
+
+A step is: rows of the batch, network forwards, control points, loss and its gradient at 32 nodes, network backwards,
+clipping, Adam. The clock is the process's CPU time, one BLAS thread; medians over the steps, shares of the parts from
+the same steps.
+
+    python benchmarks/training.py
+    python benchmarks/training.py --learn airhockey-hit --cpu-seconds 120 --rows 200000
+    python benchmarks/training.py --learn heavy-object --cpu-seconds 300 --rows 200000
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import arguments, median, progress, report, table, verdict
+
+from cnpgen.make import make_dataset
+from cnpgen.planner.kit import surroundings
+from cnpgen.planner.planner import Planner
+from cnpgen.planner.requests import problem_of, read_rows
+from cnpgen.refinement import refine_plans
+from cnpgen.threads import one_thread
+from cnpgen.training import step as parts
+from cnpgen.training.settings import Length, TrainingSettings
+from cnpgen.training.source import open_source
+from cnpgen.training.train import begin_run, prepare_run, train_model
+
+DATASETS = ("airhockey-hit", "heavy-object")
+NETWORKS = ((128, 64), (256, 128), (512, 128), (2048, 128))  # width and batch; all have a trunk of five layers
+TARGETS = {(256, 128): 12.0, (512, 128): 35.0, (2048, 128): 700.0}  # ms
+NAMES = {"forward": "forward", "control_points": "omega", "loss": "loss", "pull_back": "omega", "backward": "backward"}
+SHOWN = ("forward", "backward", "loss", "omega", "rest")
+REFINED = 200  # plans that are refined to see how far their times are from the optimum
+
+
+@dataclass
+class Clock:
+    """Sums up CPU time under names."""
+
+    spent: dict[str, float]
+
+    @contextmanager
+    def running(self, name: str) -> Iterator[None]:
+        """Add the time of the block."""
+        begun = time.process_time()
+        yield
+        self.spent[name] = self.spent.get(name, 0.0) + time.process_time() - begun
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function with its time added."""
+        def run(*positional: Any, **named: Any) -> Any:
+            with self.running(name):
+                return function(*positional, **named)
+
+        return run
+
+
+def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: str) -> dict[str, Any]:
+    """Time steps of one network: milliseconds, and the share of every part."""
+    settings = TrainingSettings(hidden=hidden, batch_size=batch)
+    source, clock, times = open_source(folder), Clock({}), []
+    with one_thread(), surroundings(problem_of(source.dataset.plan), backend) as given:
+        run, _ = prepare_run(source, given, settings, check_rows=1)
+        state = begin_run(run, Length(steps=10**6))
+        gradient = np.empty_like(state.adam.parameters)
+        for _ in range(3):
+            run.step(state, gradient)
+        with patched(clock, run):
+            for _ in range(steps):
+                begun = time.process_time()
+                run.step(state, gradient)
+                times.append(time.process_time() - begun)
+    total = sum(times)
+    shares = {name: clock.spent.get(name, 0.0) / total for name in SHOWN[:-1]}
+    return {"ms": 1e3 * median(times), "shares": shares | {"rest": 1 - sum(shares.values())}}
+
+
+@contextmanager
+def patched(clock: Clock, run: Any) -> Iterator[None]:
+    """Time the parts of a step."""
+    before = {name: getattr(parts, name) for name in NAMES if hasattr(parts, name)}
+    learner = run.learner
+    for name, function in before.items():
+        setattr(parts, name, clock.timed(NAMES[name], function))
+    object.__setattr__(learner, "loss", clock.timed("loss", learner.loss))
+    yield
+    for name, function in before.items():
+        setattr(parts, name, function)
+
+
+def measure_steps(folders: dict[str, Path], count: int) -> tuple[list[dict[str, Any]], str]:
+    found, rows = [], []
+    for name, folder in folders.items():
+        cases = [(*network, "compiled") for network in NETWORKS] + [(128, 64, "numpy")]
+        for hidden, batch, backend in cases:
+            progress(f"{name}, 5 x {hidden}, batch {batch}, {backend}")
+            steps = max(count * 128 // hidden, 5) if backend == "compiled" else 10
+            result = time_steps(folder, hidden, batch, steps=steps, backend=backend)
+            found.append({"dataset": name, "hidden": hidden, "batch": batch, "backend": backend, **result})
+            target = TARGETS.get((hidden, batch)) if backend == "compiled" else None
+            shares = " / ".join(f"{100 * result['shares'][part]:.0f}" for part in SHOWN)
+            cells = (name, f"5 x {hidden}", str(batch), backend, f"{result['ms']:.2f}")
+            rows.append((*cells, shares, *verdict(result["ms"], target, at_most=True)))
+    head = ("dataset", "network", "batch", "backend", "ms", f"% {' / '.join(SHOWN)}", "target", "")
+    return found, table("a training step", head, rows, left=2)
+
+
+def learn(name: str, seconds: float, rows: int, seed: int, folder: Path) -> tuple[dict[str, Any], str]:
+    """Train on fresh rows, judge all of the held-out rows, refine some."""
+    data, out = folder / "rows", folder / "model.h5"
+    progress(f"drawing {rows:,} rows of {name}")
+    make_dataset(name, data, n=rows, seed=seed, workers=1)
+    progress(f"training for {seconds:g} s of CPU time")
+    trained = train_model(data, out, cpu_seconds=seconds)
+    planner = Planner(trained.model)
+    asked = read_rows(data, planner.model, n=REFINED)
+    plans = planner.plan_batch(asked.boundary)
+    progress(f"refining {REFINED} plans")
+    refined = refine_plans(plans)
+    good = refined.valid
+    ratio = plans.duration[good].mean() / refined.plans.duration[good].mean()
+    facts = {
+        **{key: value for key, value in trained.score.items() if key not in {"score", "broken"}},
+        "cpu_seconds": trained.model.training["cpu_seconds"],
+        "steps": trained.model.training["steps"],
+        "duration_over_refined": float(ratio),
+        "refined_valid": float(good.mean()),
+    }
+    cells = [(key.replace("_", " "), f"{value:,.4g}") for key, value in facts.items()]
+    return facts, table(f"{name} from scratch", ("what", "value"), cells)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--steps", type=int, default=100, help="timed steps of the smallest network")
+    parser.add_argument("--learn", choices=(*DATASETS, "airhockey-replan"), help="train on this instead")
+    parser.add_argument("--cpu-seconds", type=float, default=120.0)
+    parser.add_argument("--rows", type=int, default=200_000)
+    parser.add_argument("--seed", type=int, default=1, help="of the rows; other ones than the shipped datasets'")
+
+
+def main() -> None:
+    chosen = arguments(__doc__, options)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if chosen.learn:
+            facts, text = learn(chosen.learn, chosen.cpu_seconds, chosen.rows, chosen.seed, folder)
+            report({"learned": facts}, [text], as_json=chosen.json)
+            return
+        folders = {each: folder / each for each in DATASETS}
+        for each, path in folders.items():
+            make_dataset(each, path, n=4096, workers=1)
+        found, text = measure_steps(folders, chosen.steps)
+    report({"steps": found}, [text], as_json=chosen.json)
+
+
+if __name__ == "__main__":
+    main()
