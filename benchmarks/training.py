@@ -55,6 +55,7 @@ class Clock:
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return the function with its time added."""
+
         def run(*positional: Any, **named: Any) -> Any:
             with self.running(name):
                 return function(*positional, **named)
