@@ -20,7 +20,6 @@ from cnpgen.trajectory.motion import Motion
 if TYPE_CHECKING:
     from cnpgen.refine.task import Refined
     from cnpgen.robots.robot import Robot
-    from cnpgen.verdict.verdict import Verdict
 
 Array = NDArray[np.float64]
 
@@ -67,10 +66,10 @@ class CertifiedPlan(Stage):
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
         from cnpgen.refine.criterion import choose_criterion
+        from cnpgen.refine.jury import Jury
         from cnpgen.refine.polish import refine_task
         from cnpgen.refine.refiner import Refiner
         from cnpgen.refine.task import Task
-        from cnpgen.verdict.judge import judge
         from cnpgen.verify.world import World
 
         problem, robot = context.problem, context.robot
@@ -82,9 +81,7 @@ class CertifiedPlan(Stage):
             criterion=choose_criterion(problem),
         )
 
-        def verdict(task: Task, path: Array, rate: Array) -> "Verdict":
-            motion, ends = Motion(path[None], rate[None], refiner.spec.degree), (task.start_xyz, task.goal_xyz)
-            return judge(problem, robot, motion, task.boundary, *(end[None] for end in ends))[0]
+        jury = Jury(problem, robot, degree=refiner.spec.degree)
 
         def run(batch: Batch, _random: np.random.Generator) -> None:
             ends = (*_ENDS, "goal_ddq") if "goal_ddq" in batch.columns else _ENDS
@@ -93,7 +90,7 @@ class CertifiedPlan(Stage):
             tops = obstacle_tops(problem, starts, goals)
             with one_thread():
                 found = [
-                    refine_task(refiner, verdict, Task(boundary[i : i + 1], tops[i], starts[i], goals[i]))
+                    refine_task(refiner, jury, Task(boundary[i : i + 1], tops[i], starts[i], goals[i]))
                     for i in range(len(boundary))
                 ]
             _write(batch, found, refiner.spec, robot.n)
@@ -114,21 +111,33 @@ def _write(batch: Batch, found: "list[Refined]", spec: TrajectorySpec, n: int) -
     batch.reject(np.array([each.valid for each in found], bool), NO_PLAN)
 
 
-def check_plans(problem: Problem, robot: "Robot", columns: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Judge the plans that rows of a certified dataset hold.
+@dataclass(frozen=True)
+class PlanCheck:
+    """What the verdict says of the plans in rows of a certified dataset.
+
+    Attributes:
+        judged: How many plans there are.
+        valid: How many of them are valid.
+        problems: What is wrong, a line each.
+    """
+
+    judged: int = 0
+    valid: int = 0
+    problems: tuple[str, ...] = ()
+
+
+def check_plans(problem: Problem, robot: "Robot", columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
+    """Judge the plans that rows of a certified dataset hold; rows of others hold none.
 
     Args:
         problem: The problem.
         robot: Its robot.
         columns: Field -> values, shape (rows, width) or (rows,).
-
-    Returns:
-        What is wrong; nothing where rows hold no plans.
     """
     from cnpgen.verdict.judge import judge
 
     if "path_control_points" not in columns:
-        return []
+        return PlanCheck()
     rows, spec = len(columns["start_q"]), problem.trajectory
     motion = Motion(
         columns["path_control_points"].reshape(rows, -1, robot.n), columns["rate_control_points"], spec.degree
@@ -142,7 +151,7 @@ def check_plans(problem: Problem, robot: "Robot", columns: Mapping[str, NDArray[
         problems.append(f"{len(wrong)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
     if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
         problems.append("durations are not those of the plans")
-    return problems
+    return PlanCheck(rows, rows - len(wrong), tuple(problems))
 
 
 def certified(recipe: DatasetRecipe) -> DatasetRecipe:

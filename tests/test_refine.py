@@ -13,6 +13,7 @@ from cnpgen.kernels.library import KernelLibrary, default_cache_folder
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.grid import make_grid
 from cnpgen.refine.options import RefineOptions
+from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.sqp import Bounds, Settings, minimise
@@ -54,12 +55,8 @@ def verdict(plan: Plan, boundary: Boundary, path: np.ndarray, rate: np.ndarray) 
 
 
 def refine(plan: Plan, boundary: Boundary | None = None, **given: np.ndarray) -> Refined:
-    asked = boundary or plan.boundary
-    return refine_task(
-        refiner(plan.problem.name),
-        lambda _, path, rate: verdict(plan, asked, path, rate),
-        task(plan, asked, **given),
-    )
+    jury = Jury(plan.problem, plan.robot, degree=plan.problem.trajectory.degree)
+    return refine_task(refiner(plan.problem.name), jury, task(plan, boundary, **given))
 
 
 def transcription(

@@ -52,11 +52,11 @@ class BoundsTemplate:
         ]
         tables = [_bounds(constraint, condition, s, tightening) for constraint, condition in pairs]
         self._s = s
-        self._lower = np.concatenate([low for low, _ in tables], axis=1)
-        self._upper = np.concatenate([high for _, high in tables], axis=1)
+        self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
+        self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._pairs = pairs
         needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in pairs])
-        self._sharp = np.zeros(self._lower.shape, bool)
+        self._sharp = np.zeros(self._lower.shape, bool, order="F")
         self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = needs == 2
 
     def of(self, start_tip: Array) -> Bounds:
@@ -68,7 +68,7 @@ class BoundsTemplate:
             wider = constraint.funnel(condition, self._s, start_tip)
             if np.any(wider > 0):
                 scale = _scale(constraint, condition)
-                lower, upper = lower.copy(), upper.copy()
+                lower, upper = lower.copy("F"), upper.copy("F")
                 lower[:, column : column + width] -= wider[:, None] / scale
                 upper[:, column : column + width] += wider[:, None] / scale
             column += width

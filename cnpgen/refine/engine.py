@@ -11,15 +11,13 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.problem import ProblemRecord, open_problem
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.refine.criterion import choose_criterion
+from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.sqp import Settings
 from cnpgen.refine.task import Refined, Task
 from cnpgen.robots.obstacles import obstacle_tops
-from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.judge import judge
-from cnpgen.verdict.verdict import Verdict
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem
@@ -37,13 +35,8 @@ def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
     """
     refiner = prepare(plans, options)
     problem, robot = open_problem(plans.problem)
-
-    def verdict(task: Task, path: Array, rate: Array) -> Verdict:
-        motion = Motion(path[None], rate[None], plans.degree)
-        ends = (task.start_xyz[None], task.goal_xyz[None])
-        return judge(problem, robot, motion, task.boundary, *ends, step=options.step)[0]
-
-    return [refine_task(refiner, verdict, task) for task in _tasks(plans, problem)]
+    jury = Jury(problem, robot, degree=plans.degree, step=options.step)
+    return [refine_task(refiner, jury, task) for task in _tasks(plans, problem)]
 
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:

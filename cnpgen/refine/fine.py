@@ -68,7 +68,7 @@ class FineCheck:
     def measure(self, task: Task, x: Array) -> tuple[float, Excess]:
         """Return the objective and the excess of a motion."""
         motion = self.transcription(task)
-        cost, (_, g) = motion.objective(*motion.unpack(x)), motion.value(x)
+        cost, g = motion.measured(x)
         bounds = self._bounds.of(task.start_xyz)
         with np.errstate(invalid="ignore"):
             beyond = np.maximum(g - bounds.upper, bounds.lower - g)

@@ -1,18 +1,17 @@
 """From attempts to a plan: the verdict of Pinocchio and Coal decides, and none comes back worse than it was given."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.refine.jury import Jury
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Attempt, Outcome, Refined, Task
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict.verdict import Reason, Verdict
 
 Array = NDArray[np.float64]
-Judge = Callable[[Task, Array, Array], Verdict]  # of a task, path control points (C, n) and rate control points (R,)
 
 HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless there is no better one
 
@@ -41,7 +40,7 @@ class _Search:
 
     Attributes:
         refiner: What makes attempts.
-        judge: Who decides.
+        jury: Who decides.
         task: The task.
         iterations: Steps of all attempts so far.
         judged: Attempts with their verdicts.
@@ -49,7 +48,7 @@ class _Search:
     """
 
     refiner: Refiner
-    judge: Judge
+    jury: Jury
     task: Task
     iterations: int = 0
     judged: list[_Candidate] = field(default_factory=list)
@@ -70,9 +69,16 @@ class _Search:
             self.judged.append(self._candidate(min(self.hopeless, key=lambda each: (each.excess, each.cost))))
         return min(self.judged, key=lambda each: each.rank)
 
+    def may_be_better(self, path: Array, rate: Array, best: Refined) -> bool:
+        """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted at once."""
+        if not best.valid:
+            return True
+        cost = self.refiner.check.transcription(self.task).objective(path, rate)
+        return cost <= best.cost and not self.jury.refutes(self.task, path, rate)
+
     def weigh(self, path: Array, rate: Array, outcome: Outcome) -> _Candidate:
         """Judge a plan."""
-        verdict = self.judge(self.task, path, rate)
+        verdict = self.jury.verdict(self.task, path, rate)
         cost = self.refiner.check.transcription(self.task).objective(path, rate)
         reached = outcome if verdict.valid or outcome is Outcome.KEPT else Outcome.UNSOLVED
         return _Candidate(Refined(path, rate, reached, verdict.reason, 0, cost), _severity(verdict))
@@ -82,23 +88,23 @@ class _Search:
         return self.weigh(path, rate, attempt.outcome)
 
 
-def refine_task(refiner: Refiner, judge: Judge, task: Task) -> Refined:
+def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
     """Refine the plan of a task, or make one.
 
     Args:
         refiner: What makes attempts.
-        judge: Who decides whether one is valid.
+        jury: Who decides whether one is valid.
         task: The boundary problem.
     """
     if not task.is_finite:
         return _unusable(refiner, task)
-    search, given = _Search(refiner, judge, task), refiner.given(task)
+    search, given = _Search(refiner, jury, task), refiner.given(task)
     for attempt in refiner.attempts(task, given):
         if search.offer(attempt):
             break
     best = search.best()
     for path, rate in _as_given(refiner, task, given):
-        if not best.refined.valid or refiner.check.transcription(task).objective(path, rate) <= best.refined.cost:
+        if search.may_be_better(path, rate, best.refined):
             kept = search.weigh(path, rate, Outcome.KEPT)
             best = min(best, kept, key=lambda each: each.rank)
     return Refined(**{**vars(best.refined), "iterations": search.iterations})

@@ -15,6 +15,7 @@ from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 INFINITE = 1e30
+ELASTIC = 1e-2  # curvature of the elastic variable's cost; far smaller ones triple the working-set changes
 LEAP = 1.5  # the next step may be longer than the last one by this factor
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 
@@ -158,10 +159,10 @@ def _choose(g: Array, bounds: Bounds, thin: int, near: float, leaps: Array) -> N
     over it.
     """
     excess = bounds.excess(g)
-    peak = np.zeros(excess.shape, bool)
+    peak = np.zeros(excess.shape, bool, order="F")
     peak[1:-1] = (excess[1:-1] >= excess[:-2]) & (excess[1:-1] >= excess[2:])
     peak[0], peak[-1] = excess[0] >= excess[1], excess[-1] >= excess[-2]
-    wide = peak.copy()
+    wide = peak.copy("F")
     wide[1:] |= peak[:-1]
     wide[:-1] |= peak[1:]
     wide[::thin] = True
@@ -202,7 +203,7 @@ def _solve(  # noqa: PLR0917
     hessian[:nx, :nx] = at.curvature
     diagonal = np.arange(nx)
     hessian[diagonal, diagonal] += settings.proximal
-    hessian[nx, nx] = 1e-8
+    hessian[nx, nx] = ELASTIC
     linear = np.append(at.gradient, settings.penalty * violation + 1e-3)
     sense = np.zeros(nx + 1 + m, np.int32)
     if multipliers is not None:

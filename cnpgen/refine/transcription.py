@@ -82,6 +82,7 @@ class Transcription:
         self.interior = spec.path_control_points - 3 - boundary.fixed_at_goal
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
+        self.tops = tops
         self._tops = np.repeat(tops[:, None], len(grid.s), axis=1)
         second = np.diff(np.eye(spec.rate_control_points), 2, axis=0)
         self._smooth = 2 * SMOOTH_RATE * second.T @ second
@@ -98,14 +99,16 @@ class Transcription:
         return np.concatenate([path[3:end].ravel(), np.log(rate)])
 
     def value(self, x: Array) -> tuple[float, Array]:
-        """Evaluate objective and residuals (K, m) only."""
+        """Evaluate what is minimised, and residuals (K, m), without derivatives."""
+        cost, g = self.measured(x)
+        log = x[self.split :]
+        return float(cost + 0.5 * log @ self._smooth @ log), g
+
+    def measured(self, x: Array) -> tuple[float, Array]:
+        """Evaluate ``objective`` and residuals (K, m)."""
         w, path, rate = self._at(x)
         (g,) = self.stage.values(w, self._tops)
-        log = x[self.split :]
-        cost = self.grid.weights @ (1.0 / (self.grid.gauss @ rate)) + 0.5 * log @ self._smooth @ log
-        if self.stage.criterion is not None:
-            cost += self._criterion(path, rate)
-        return float(cost), g.T
+        return self.objective(path, rate), g.T
 
     def objective(self, path: Array, rate: Array) -> float:
         """Return the objective of a motion [s]: its duration and the criterion, without what fixes the gauge.

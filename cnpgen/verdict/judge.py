@@ -1,4 +1,8 @@
-"""Check plans with Pinocchio and Coal on a fine time grid, sharing no code with what optimised them."""
+"""Check plans with Pinocchio and Coal on a fine time grid.
+
+With what optimised them it shares the problem, with its bounds, tolerances and where its obstacles stand, and what
+control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or distances, and no transcription.
+"""
 
 from dataclasses import dataclass
 
@@ -23,6 +27,7 @@ from cnpgen.verify.path import PathWorld
 
 Array = NDArray[np.float64]
 
+_GLANCE = np.linspace(0, 1, 33)  # phases at which most plans that are not valid show it
 JERK_RATE = 5.0  # 1/s: the authors' jerk limit, reported and not constrained, is 5 x the acceleration limit
 
 
@@ -41,8 +46,8 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
     and at more of them near both ends (``cnpgen.verdict.sampling``). A plan is valid if it meets its boundary
     conditions and exceeds every bound by no more than the constraint allows. Numbers that cannot be evaluated give a
-    verdict that says so, no exception. What lies between two samples is not seen; of contacts, whose depth has sharp
-    peaks, the deepest are looked at more closely (``cnpgen.verdict.closer``).
+    verdict that says so, no exception. What lies between two samples is not seen; only contacts, whose depth has sharp
+    peaks, are looked at more closely wherever more than is allowed could hide (``cnpgen.verdict.closer``).
 
     Args:
         problem: The problem.
@@ -56,21 +61,48 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     Raises:
         UsageError: Shapes that do not fit together, or a step that is not positive.
     """
-    _check_shapes(robot, motion, boundary, start_xyz, goal_xyz)
-    check_step(step)
-    world, tops = PathWorld(problem, robot), obstacle_tops(problem, start_xyz, goal_xyz)
-    with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
+    return Judge(problem, robot, step=step)(motion, boundary, start_xyz, goal_xyz)
+
+
+class Judge:
+    """Judges plans of one problem as ``judge`` does, with the memory of Pinocchio and Coal kept from call to call.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        step: Time step [s].
+
+    Raises:
+        UsageError: The step is not positive.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
+        check_step(step)
+        self._problem, self._robot, self._step = problem, robot, step
+        self._world = PathWorld(problem, robot)
+
+    def __call__(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[Verdict]:
+        """Judge N plans; arguments as of ``judge``."""
+        plans = self._plans(motion, boundary, start_xyz, goal_xyz)
+        with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
+            return [_judge_plan(plan, self._world, self._step) for plan in plans]
+
+    def refutes(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[bool]:
+        """Say of N plans whether a few samples show that they are not valid; of those that pass nothing is known."""
+        plans = self._plans(motion, boundary, start_xyz, goal_xyz)
+        with np.errstate(all="ignore"):
+            return [_is_refuted(plan, self._world) for plan in plans]
+
+    def _plans(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> "list[_Plan]":
+        _check_shapes(self._robot, motion, boundary, start_xyz, goal_xyz)
+        tops = obstacle_tops(self._problem, start_xyz, goal_xyz)
         return [
-            _judge_plan(
-                _Plan(
-                    problem,
-                    Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
-                    boundary[i : i + 1],
-                    tops[i],
-                    goal_xyz[i],
-                ),
-                world,
-                step,
+            _Plan(
+                self._problem,
+                Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
+                boundary[i : i + 1],
+                tops[i],
+                goal_xyz[i],
             )
             for i in range(len(motion))
         ]
@@ -143,6 +175,20 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
     paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
     margins = keep_worse(margins, look_closer(plan.problem, world, plan.motion, samples, plan.tops))
     return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
+
+
+def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
+    """Whether the ends, or a constraint at one of a few phases, are wrong."""
+    if not plan.is_finite() or not plan.motion.runs_forward()[0]:
+        return True
+    samples = Samples(_GLANCE, _GLANCE)
+    states = course(plan.motion, samples.s)
+    if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
+        return True
+    if not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names)):
+        return True
+    world.set_path(states.q, states.dq, states.ddq, plan.tops)
+    return not all(margin.ok for margin in constraint_margins(plan.problem, world, samples))
 
 
 def _samples(plan: _Plan, step: float) -> Samples | Verdict:
