@@ -8,7 +8,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError
 from cnpgen.library import restore_dataset_recipe
 from cnpgen.recipes import DatasetRecipe, resolved_digest
-from cnpgen.store.check import Finding
+from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.documents import load_document, plain
 from cnpgen.store.layout import PLAN, STATS
 from cnpgen.store.plan import DatasetPlan
@@ -20,9 +20,10 @@ def check_recipe(plan: DatasetPlan) -> list[Finding]:
     try:
         found = resolved_digest(plan.recipe["pipeline"], str(plan.robot["urdf"]).encode())
     except (KeyError, TypeError, AttributeError):
-        return [Finding(PLAN, "has no recipe that can be read")]
-    same = found == plan.recipe_sha256
-    return [] if same else [Finding(PLAN, f"its recipe has the sha256 {found}, not the recorded {plan.recipe_sha256}")]
+        return [Finding(PLAN, "has no recipe that can be read", advice=REPLACE)]
+    if found == plan.recipe_sha256:
+        return []
+    return [Finding(PLAN, f"its recipe has the sha256 {found}, not the recorded {plan.recipe_sha256}", advice=REPLACE)]
 
 
 def check_statistics(folder: Path, plan: DatasetPlan) -> list[Finding]:
@@ -33,7 +34,10 @@ def check_statistics(folder: Path, plan: DatasetPlan) -> list[Finding]:
     except DatasetError:  # missing or damaged: found already
         return []
     wrong = [key for key in expected if document.get(key) != expected[key]]
-    return [Finding(STATS, f"does not sum up the shards' records: {', '.join(wrong)} differ")] if wrong else []
+    if not wrong:
+        return []
+    advice = f"delete {STATS} and run the same make-dataset command again: it writes the file anew"
+    return [Finding(STATS, f"does not sum up the shards' records: {', '.join(wrong)} differ", advice=advice)]
 
 
 @contextmanager

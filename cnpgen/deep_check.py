@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.certification import check_plans
+from cnpgen.certification import PlanCheck, check_plans
 from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError
 from cnpgen.robots.robot import load_robot
@@ -26,10 +26,27 @@ from cnpgen.workers import share_out
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 
 
+@dataclass(frozen=True)
+class DeepCheck:
+    """What the deep check found in a dataset.
+
+    Attributes:
+        rows: What Pinocchio and Coal say of all rows, or None if none could be read.
+        judged: How many plans the rows hold; 0 unless the dataset is certified.
+        valid: How many of them are valid.
+        findings: What is wrong, by file.
+    """
+
+    rows: RowReport | None
+    judged: int
+    valid: int
+    findings: list[Finding]
+
+
 def check_rows(
     folder: Path, plan: DatasetPlan, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
-) -> tuple[RowReport | None, list[Finding]]:
-    """Recompute every row, shard by shard.
+) -> DeepCheck:
+    """Recompute every row, shard by shard, and judge every plan.
 
     Args:
         folder: The dataset.
@@ -37,24 +54,21 @@ def check_rows(
         tasks: The shards to read.
         workers: Processes.
         progress: Called with the rows of every shard that was read.
-
-    Returns:
-        What Pinocchio and Coal say of all rows, or None if none could be read; and what is wrong, by file.
     """
-    reports, findings, keys = [], [], [np.empty(0, np.uint64)]
+    checks, findings = [], []
     with closing(share_out(partial(_verify_shard, folder, plan), tasks, workers, ordered=True)) as results:
         for task, result in zip(tasks, results, strict=True):
             findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
-            if result.report is not None:
-                reports.append(result.report)
-            keys.append(result.keys)
+            checks.append(result)
             if progress is not None:
                 progress(task.rows)
-    every = np.concatenate(keys)
+    every = np.concatenate([np.empty(0, np.uint64), *(check.keys for check in checks)])
     twice = len(every) - len(np.unique(every))
     if twice:
         findings.append(Finding("(all splits)", f"{counted(twice, 'row')} that stand in the dataset before, too"))
-    return merge(reports) if reports else None, findings
+    reports = [check.report for check in checks if check.report is not None]
+    judged, valid = (sum(getattr(check.plans, what) for check in checks) for what in ("judged", "valid"))
+    return DeepCheck(merge(reports) if reports else None, judged, valid, findings)
 
 
 @dataclass(frozen=True)
@@ -65,11 +79,13 @@ class _ShardCheck:
         report: What Pinocchio and Coal say, or None if the shard cannot be read.
         problems: What is wrong with it.
         keys: A hash of the boundary states of every row, shape (rows,).
+        plans: What the verdict says of its plans.
     """
 
     report: RowReport | None
     problems: list[str]
     keys: NDArray[np.uint64]
+    plans: PlanCheck
 
 
 def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardCheck:
@@ -78,13 +94,13 @@ def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardChe
         columns = read_shard(folder / task.file)
         record = load_record(folder, task)
     except CnpgenError as error:
-        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64))
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck())
     with restored(plan) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
         report = verify_rows(problem, robot, columns, dtype=plan.dtype)
-        problems = check_plans(problem, robot, columns)
-    problems += check_numbers(plan, task, columns, record)
+        plans = check_plans(problem, robot, columns)
+    problems = [*plans.problems, *check_numbers(plan, task, columns, record)]
     problems += [
         f"{check.name}: {counted(check.rows_out, 'row')} out, worst {check.worst:.3g} {check.unit}"
         f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}"
@@ -93,4 +109,4 @@ def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardChe
     ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
     bits = np.ascontiguousarray(np.concatenate(ends, axis=1), np.float64).view(np.uint64)
     keys = (bits * np.resize(_ODD, bits.shape[1])).sum(axis=1, dtype=np.uint64)
-    return _ShardCheck(report, problems, keys)
+    return _ShardCheck(report, problems, keys, plans)

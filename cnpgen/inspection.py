@@ -1,4 +1,4 @@
-"""What a dataset holds and how it came about, from its plan and the sidecars of its shards; no row is read."""
+"""What a dataset holds and how it came about, from its documents and the sidecars of its shards; no row is read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,11 +6,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError
 from cnpgen.fields import Field
 from cnpgen.outcome import Outcome, densities_to_json
+from cnpgen.store.check import check_documents
 from cnpgen.store.documents import plain
 from cnpgen.store.layout import MANIFEST, PLAN
+from cnpgen.store.places import require_folder
 from cnpgen.store.plan import DatasetPlan, load_plan
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise, unfinished
@@ -25,12 +27,14 @@ class Inspection:
         summary: Its plan and the records of its finished shards.
         sealed: Whether its manifest is there.
         bytes: Size of its files.
+        damage: What is wrong with the documents of a sealed dataset, a line each; shards are not read for it.
     """
 
     folder: Path
     summary: Summary
     sealed: bool
     bytes: int
+    damage: tuple[str, ...] = ()
 
     @property
     def plan(self) -> DatasetPlan:
@@ -45,17 +49,20 @@ class Inspection:
     @property
     def complete(self) -> bool:
         """Whether all of it is there."""
-        return self.sealed and not self.summary.problems
+        return self.sealed and not self.summary.problems and not self.damage
 
     @property
     def state(self) -> str:
         """The state of the dataset in a few words."""
         if self.complete:
             return "complete"
-        if self.sealed:
-            count = f"{len(self.summary.records)} of {self.summary.n_shards} shards"
-            return f"damaged: {count} are as they were made, 'cnpgen validate' says more"
-        return unfinished(self.summary)
+        if not self.sealed:
+            return unfinished(self.summary)
+        if self.summary.problems:
+            what = f"{len(self.summary.records)} of {self.summary.n_shards} shards are as they were made"
+        else:
+            what = self.damage[0]
+        return f"damaged: {what}; 'cnpgen validate' says more"
 
     @cached_property
     def rows(self) -> dict[str, int]:
@@ -89,6 +96,7 @@ class Inspection:
             "folder": self.folder,
             **{name: getattr(plan, name) for name in ("name", "version", "title", "license")},
             **{name: getattr(self, name) for name in ("complete", "state", "bytes", "seconds")},
+            "damage": [*self.summary.problems, *self.damage] if self.sealed else [],
             "shards": {"planned": self.summary.n_shards, "finished": len(self.summary.records)},
             "rows": {split: {"planned": plan.splits[split], "stored": rows} for split, rows in self.rows.items()},
             "fields": [self._field(field) for field in plan.fields],
@@ -137,12 +145,12 @@ def inspect_dataset(folder: str | Path) -> Inspection:
         MachineError: The system would not let us read something.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise UsageError(
-            f"{folder} is {'a file' if folder.exists() else 'not there'}, expected the folder of a dataset"
-        )
+    require_folder(folder)
     if not (folder / PLAN).exists():
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
-    summary = summarise(folder, load_plan(folder), allow_partial=True)
+    plan = load_plan(folder)
+    summary = summarise(folder, plan, allow_partial=True)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    return Inspection(folder, summary, (folder / MANIFEST).is_file(), size)
+    sealed = (folder / MANIFEST).is_file()
+    damage = tuple(str(finding) for finding in check_documents(folder, plan)) if sealed else ()
+    return Inspection(folder, summary, sealed, size, damage)

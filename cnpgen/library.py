@@ -3,35 +3,29 @@
 import hashlib
 import json
 import os
-import re
-import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from cnpgen import plugins
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import PluginError, RecipeError, nearest
+from cnpgen.parsing import Reader, parse
 from cnpgen.pipelines.stage import Stage
+from cnpgen.recipe_checks import problem_mistakes, tables
+from cnpgen.recipe_files import Kind, is_kind, read_table
 from cnpgen.recipes import DatasetRecipe, Pipeline, Problem
-from cnpgen.schema import Place, Reader, parse
+from cnpgen.schema import Place
 from cnpgen.units import show
 
-Kind = Literal["problem", "pipeline", "dataset"]
 Recipe = TypeVar("Recipe", Problem, Pipeline, DatasetRecipe)
 
-# Where the shipped files of a kind are, and the top-level keys that only files of that kind have.
-_LAYOUT: dict[Kind, str] = {
+_LAYOUT: dict[Kind, str] = {  # where the shipped files of a kind are
     "problem": "problems/*/problem.toml",
     "pipeline": "pipelines/*.toml",
     "dataset": "datasets/*.toml",
-}
-_MARKS: dict[Kind, set[str]] = {
-    "problem": {"robot", "constraint", "limits"},
-    "pipeline": {"stage", "problem"},
-    "dataset": {"splits", "pipeline"},
 }
 
 
@@ -116,9 +110,9 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
 def _missing_plugins(content: dict[str, Any]) -> list[str]:
     """Say which packages a resolved recipe needs that are not installed."""
     pipeline = content["pipeline"]
-    tables = [(plugins.STAGES, table) for _, table in _tables(pipeline, "stage")]
-    tables += [(plugins.CONSTRAINTS, table) for _, table in _tables(pipeline["problem"], "constraint")]
-    found = (plugins.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for group, each in tables)
+    kinds = [(plugins.STAGES, table) for _, table in tables(pipeline, "stage")]
+    kinds += [(plugins.CONSTRAINTS, table) for _, table in tables(pipeline["problem"], "constraint")]
+    found = (plugins.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for group, each in kinds)
     return list(dict.fromkeys(text for text in found if text))
 
 
@@ -138,15 +132,6 @@ def list_recipes(kind: Kind) -> dict[str, Path]:
     folder, _, pattern = _LAYOUT[kind].partition("/")
     files = sorted((recipes_root() / folder).glob(pattern))
     return {file.parent.name if kind == "problem" else file.stem: file for file in files}
-
-
-def kind_of_file(path: Path) -> Kind:
-    """Tell the kind of a recipe file by its keys; "dataset" where they do not tell or it cannot be read."""
-    try:
-        table = _toml(path.read_bytes())
-    except (OSError, ValueError):
-        return "dataset"
-    return next((kind for kind in _MARKS if _is(kind, table)), "dataset")
 
 
 def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | None = None) -> Path:
@@ -211,7 +196,7 @@ def _load(
 
 
 def _problem(path: Path, mistakes: list[str]) -> Problem | None:
-    read = _read(path, ("problem",), mistakes)
+    read = read_table(path, ("problem",), mistakes)
     if read is None:
         return None
     data, table = read
@@ -219,7 +204,7 @@ def _problem(path: Path, mistakes: list[str]) -> Problem | None:
     readers: dict[type, Reader] = {Constraint: partial(_read_kind, plugins.CONSTRAINTS)}
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
     before = len(mistakes)
-    mistakes.extend(_problem_mistakes(table, where, path.parent))
+    mistakes.extend(problem_mistakes(table, where, path.parent))
     if problem is None or len(mistakes) > before:
         return None
     problem = replace(problem, path=path.absolute())
@@ -227,7 +212,7 @@ def _problem(path: Path, mistakes: list[str]) -> Problem | None:
 
 
 def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
-    read = _read(path, ("pipeline",), mistakes)
+    read = read_table(path, ("pipeline",), mistakes)
     if read is None:
         return None
     data, table = read
@@ -240,11 +225,11 @@ def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
-    read = _read(path, ("dataset", "pipeline"), mistakes)
+    read = read_table(path, ("dataset", "pipeline"), mistakes)
     if read is None:
         return None
     data, table = read
-    if not _is("dataset", table) and _is("pipeline", table):
+    if not is_kind("dataset", table) and is_kind("pipeline", table):
         pipeline = _pipeline(path, mistakes)
         return _wrapped(pipeline) if pipeline else None
     readers: dict[type, Reader] = {Pipeline: _reference("pipeline", _pipeline, path.parent)}
@@ -262,45 +247,6 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         path=pipeline.path,
         digest=_digest(b"", pipeline.digest.encode()),
     )
-
-
-def _read(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> tuple[bytes, dict[str, Any]] | None:
-    """Return the bytes of a recipe file and its top-level table, or None after a mistake."""
-    try:
-        data = path.read_bytes()
-        return data, _expect(kinds, _toml(data))
-    except OSError as error:
-        mistakes.append(f"{path}: cannot be read: {error.strerror}")
-    except ValueError as error:
-        mistakes.append(f"{path}: {error}")
-    return None
-
-
-def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
-    """Return the table unless it is clearly a recipe of another kind."""
-    found = [kind for kind in _MARKS if _is(kind, table)]
-    if found and not set(found) & set(kinds):
-        raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}")
-    return table
-
-
-def _toml(data: bytes) -> dict[str, Any]:
-    """Parse TOML; a ValueError says in which line it is wrong."""
-    try:
-        return tomllib.loads(data.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise ValueError(f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}") from error
-    except (ValueError, RecursionError) as error:
-        found = re.search(r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error))
-        line = int(found[1]) if found and found[1] else len(data.splitlines())
-        text = str(error).replace(found[0], "") if found else str(error)
-        raise ValueError(f"line {line}: not valid TOML: {text}") from error
-
-
-def _is(kind: Kind, table: dict[str, Any]) -> bool:
-    """Whether a top-level table has a key that only recipes of this kind have."""
-    return not _MARKS[kind].isdisjoint(table)
 
 
 def _reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
@@ -328,33 +274,6 @@ def _read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any
         return None
     rest = {key: entry for key, entry in value.items() if key != "use"}
     return parse(kind, rest, where=where, mistakes=mistakes)
-
-
-def _problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
-    """Check what is about several tables; on the raw ones, so that it is reported along with their own mistakes."""
-    robot = table.get("robot")
-    urdf = robot.get("urdf") if isinstance(robot, dict) else None
-    if isinstance(urdf, str) and not (folder / urdf).is_file():
-        hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
-        yield (where / "robot" / "urdf").says(f"no such file: {folder / urdf}{hint}")
-    yield from _repeated(table, where, "constraint", "use")
-    yield from _repeated(table, where, "obstacle", "name")
-    for index, obstacle in _tables(table, "obstacle"):
-        if obstacle.get("below") and "object" not in table:
-            yield (where / "obstacle" / index / "below").says("nothing stands on the obstacle: there is no [object]")
-
-
-def _repeated(table: dict[str, Any], where: Place, array: str, key: str) -> Iterator[str]:
-    seen: list[Any] = []
-    for index, entry in _tables(table, array):
-        if key in entry and entry[key] in seen:
-            yield (where / array / index / key).says(f"there is a {array} {show(entry[key])} already")
-        seen.append(entry.get(key))
-
-
-def _tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:
-    entries = table.get(array)
-    return [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)] if isinstance(entries, list) else []
 
 
 def _digest(*parts: bytes) -> str:

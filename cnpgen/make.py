@@ -126,7 +126,7 @@ def make_dataset(
             made += rows
             if progress is not None:
                 progress(rows, outcome)
-    complete, documents = _finish(job, _notes(loaded), made)
+    complete, documents = _finish(job, _notes(loaded), made=made, alone=part is None)
     rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.plan.splits}
     return MadeDataset(job.folder, job.plan, made, complete, rows_of, (*damaged, *documents))
 
@@ -191,17 +191,25 @@ def runs(plan: DatasetPlan, tasks: list[ShardTask], workers: int) -> list[list[S
     return [list(group) for _, group in groupby(tasks, key=lambda task: (task.split, task.first_row // rows))]
 
 
-def _finish(job: Job, notes: str, made: int) -> tuple[bool, list[str]]:
-    """Write the documents of a dataset whose shards are all there; return whether they are, and what was damaged."""
+def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list[str]]:
+    """Write the documents of a dataset whose shards are all there; return whether they are, and what was damaged.
+
+    Args:
+        job: The dataset.
+        notes: Its data card.
+        made: Rows that this call has made.
+        alone: Whether nobody else is making parts of it, who might be about to write the documents.
+    """
     if pending(job.folder, job.plan):
         return False, []
-    damaged: list[str] = []
-    if made == 0 and (job.folder / MANIFEST).exists():
+    sealed, damaged = (job.folder / MANIFEST).exists(), list[str]()
+    if made == 0 and (sealed or alone):
         findings = check_documents(job.folder, job.plan)
         if not findings:
             return True, []
         damaged = list(dict.fromkeys(finding.file for finding in findings))
-        warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
+        what = findings[0] if sealed else f"{MANIFEST}: it was missing, though every shard is there"
+        warnings.warn(f"written again: {what}", RuntimeWarning, stacklevel=3)
     finalize(job.folder, notes=notes)
     return True, damaged
 

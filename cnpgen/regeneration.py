@@ -1,5 +1,6 @@
 """Blocks of a dataset made again from its seed, to compare them with what is stored."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,31 @@ PORTABLE = 1e-9  # what the rows of another machine or backend may differ by whe
 PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32
 
 
-def make_again(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> tuple[int, int, list[Finding]]:
+@dataclass(frozen=True)
+class Regeneration:
+    """Blocks that were made again.
+
+    Attributes:
+        made: How many.
+        blocks: How many there are to choose from.
+        identical: How many came out with the same bits.
+        findings: What differs by more than arithmetic.
+    """
+
+    made: int = 0
+    blocks: int = 0
+    identical: int = 0
+    findings: tuple[Finding, ...] = ()
+
+
+def make_again(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> Regeneration:
     """Make random blocks again.
 
     Args:
         folder: The dataset.
         plan: Its plan.
         tasks: The shards whose blocks may be chosen.
-        count: How many blocks to choose.
-
-    Returns:
-        How many blocks were made, how many of them are the same to the bit, and what differs by more than arithmetic.
+        count: How many blocks to choose; all of them if there are fewer.
 
     Raises:
         MachineError: The backend that made the dataset does not work here.
@@ -54,7 +69,7 @@ def make_again(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: i
             if problem:
                 text = f"block {block} made again from the seed: {problem}{_explanation(plan, recipe)}"
                 findings.append(Finding(task.file, text))
-    return len(chosen), identical, findings
+    return Regeneration(len(chosen), len(pieces), identical, tuple(findings))
 
 
 def backend_of(folder: Path, plan: DatasetPlan) -> tuple[Backend, Path]:

@@ -44,7 +44,8 @@ _DIMENSIONS = {
     "kg m^2": "an inertia [kg m^2]",
 }
 
-_QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)(.*)", re.DOTALL)
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_QUANTITY = re.compile(rf"\s*({_NUMBER.pattern})(.*)", re.DOTALL)
 _LIST = re.compile(r"\s*\[(.*)\](.*)", re.DOTALL)
 _SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"), ("µ", "u"))
 
@@ -97,6 +98,8 @@ def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[f
         ValueError: It is no list, has the wrong length, or one of its entries is wrong.
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
+    if match:
+        _check_commas(match, value)
     items = [f"{item.strip()} {match[2].strip()}".strip() for item in match[1].split(",")] if match else value
     if not isinstance(items, list):
         raise ValueError(f"expected a list, each {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's mistake
@@ -127,6 +130,14 @@ def parse_range(value: Any, unit: str) -> tuple[float, float]:
     if low > high:
         raise ValueError(f"empty range {show(value)}: its low end is above its high end")
     return low, high
+
+
+def _check_commas(match: re.Match[str], value: object) -> None:
+    """Say what is missing in ``"[0.6 1.3] m"``."""
+    items = [re.split(r"[;\s]+", item.strip()) for item in match[1].split(",")]
+    if any(len(words) > 1 and all(map(_NUMBER.fullmatch, words)) for words in items):
+        meant = ", ".join(word for words in items for word in words)
+        raise ValueError(f"numbers are separated by commas, got {show(value)} (did you mean '[{meant}]{match[2]}'?)")
 
 
 def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> float:

@@ -8,9 +8,10 @@ from typing import Any
 from cnpgen.consistency import check_recipe, check_statistics, restored
 from cnpgen.deep_check import check_rows
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.regeneration import backend_of, make_again
+from cnpgen.regeneration import Regeneration, backend_of, make_again
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.layout import PLAN
+from cnpgen.store.places import require_folder
 from cnpgen.store.plan import load_plan, shards
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
@@ -28,7 +29,10 @@ class ValidationReport:
         rows: Rows of the shards that are there.
         findings: What is wrong, file by file.
         deep: What Pinocchio and Coal say of every row, or None if they were not asked.
-        regenerated: How many blocks were made again.
+        plans: Plans that were judged, and how many of them are valid; None unless the deep check met some.
+        wanted: How many blocks were to be made again.
+        blocks: How many there are to choose from.
+        regenerated: How many were made again.
         identical: How many of them came out with the same bits.
     """
 
@@ -36,6 +40,9 @@ class ValidationReport:
     rows: int
     findings: tuple[Finding, ...]
     deep: RowReport | None = None
+    plans: tuple[int, int] | None = None
+    wanted: int = 0
+    blocks: int = 0
     regenerated: int = 0
     identical: int = 0
 
@@ -55,6 +62,8 @@ class ValidationReport:
                 for item in self.findings
             ],
             "deep": self.deep.to_dict() if self.deep else None,
+            "plans": dict(zip(("judged", "valid"), self.plans, strict=True)) if self.plans else None,
+            "blocks": self.blocks,
             "regenerated": self.regenerated,
             "identical": self.identical,
         }
@@ -72,10 +81,17 @@ class ValidationReport:
                 f" {counted(check.rows_out, 'row')} out"
                 for check in self.deep.checks
             ]
-        if self.regenerated:
-            lines.append(f"  made again: {counted(self.regenerated, 'block')}, {self.identical} identical to the bit")
+        if self.plans:
+            lines.append(f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
+        if self.wanted:
+            lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
         advice = dict.fromkeys(finding.advice for finding in self.findings if finding.advice and not finding.note)
         return "\n".join([*lines, *(f"  what to do: {text}" for text in advice)])
+
+    def _blocks_text(self) -> str:
+        """Say how many blocks were made again, of how many."""
+        text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}"
+        return f"{text} ({self.wanted:,} were asked for)" if self.wanted > self.blocks else text
 
 
 def validate_dataset(
@@ -107,9 +123,7 @@ def validate_dataset(
             made again.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        what = "a file" if folder.exists() else "not there"
-        raise UsageError(f"{folder} is {what}, expected the folder of a dataset")
+    require_folder(folder)
     if not is_dataset(folder):
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
     if regenerate < 0:
@@ -127,13 +141,23 @@ def validate_dataset(
     wrong = {finding.file for finding in findings if not finding.note}
     present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
     whole = [task for task in present if task.file not in wrong]
-    report, made, identical = None, 0, 0
+    checked, again = None, Regeneration()
     findings += check_recipe(plan)
     if deep:
         findings += check_statistics(folder, plan)
-        report, found = check_rows(folder, plan, whole, worker_count(workers, len(whole)), progress)
-        findings += found
+        checked = check_rows(folder, plan, whole, worker_count(workers, len(whole)), progress)
+        findings += checked.findings
     if regenerate:
-        made, identical, found = make_again(folder, plan, whole, regenerate)
-        findings += found
-    return ValidationReport(folder, sum(task.rows for task in present), tuple(findings), report, made, identical)
+        again = make_again(folder, plan, whole, regenerate)
+        findings += again.findings
+    return ValidationReport(
+        folder,
+        sum(task.rows for task in present),
+        tuple(findings),
+        deep=None if checked is None else checked.rows,
+        plans=(checked.judged, checked.valid) if checked is not None and checked.judged else None,
+        wanted=regenerate,
+        blocks=again.blocks,
+        regenerated=again.made,
+        identical=again.identical,
+    )

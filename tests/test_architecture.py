@@ -14,10 +14,10 @@ PACKAGE = Path(__file__).parents[1] / "cnpgen"
 LAYERS = (
     ("errors", "units", "fields", "outcome", "wording", "threads"),
     ("workers",),
-    ("schema",),
+    ("schema", "parsing"),
     ("constraints", "pipelines.stage"),
     ("plugins",),
-    ("recipes", "library"),
+    ("recipes", "recipe_files", "recipe_checks", "library"),
     ("robots",),
     ("kernels",),
     ("pipelines",),

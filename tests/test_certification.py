@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from cnpgen.certification import NO_PLAN, CertifiedPlan, certified, check_plans
+from cnpgen.certification import NO_PLAN, CertifiedPlan, PlanCheck, certified, check_plans
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
 from cnpgen.library import load_dataset_recipe
@@ -35,7 +35,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_row_holds_a_plan_that_deep_validation_judges(folder: Path) -> None:
-    assert validate_dataset(folder, deep=True, regenerate=1, workers=1).ok
+    report = validate_dataset(folder, deep=True, regenerate=1, workers=1)
+    assert report.ok
+    assert report.to_dict()["plans"] == {"judged": ROWS, "valid": ROWS}
+    assert f"judged on a time grid of 1 ms: {ROWS} plans, {ROWS} valid" in report.summary()
     rows = open_dataset(folder).read("train")
     assert rows["path_control_points"].shape == (11, 15 * 6)
     assert rows["rate_control_points"].shape == (11, 20)
@@ -79,17 +82,15 @@ def test_samples_without_a_plan_are_counted_under_their_reason(tmp_path: Path, m
 def test_a_plan_that_does_not_hold_is_found(folder: Path, tmp_path: Path) -> None:
     problem = load_dataset_recipe("airhockey-hit").pipeline.problem
     robot, rows = load_robot(problem), dict(open_dataset(folder).read("train"))
-    assert check_plans(problem, robot, rows) == []
+    assert check_plans(problem, robot, rows) == PlanCheck(judged=11, valid=11)
     path = rows["path_control_points"].copy()
     path[3, 40] += 0.1
-    assert (
-        "1 of 11 plans are not valid, the first one is that of row 3"
-        in check_plans(problem, robot, rows | {"path_control_points": path})[0]
-    )
-    assert check_plans(problem, robot, rows | {"duration": 2 * rows["duration"]}) == [
-        "durations are not those of the plans"
-    ]
-    assert check_plans(problem, robot, {"start_q": rows["start_q"]}) == []
+    found = check_plans(problem, robot, rows | {"path_control_points": path})
+    assert (found.judged, found.valid) == (11, 10)
+    assert "1 of 11 plans are not valid, the first one is that of row 3" in found.problems[0]
+    wrong = check_plans(problem, robot, rows | {"duration": 2 * rows["duration"]})
+    assert wrong.problems == ("durations are not those of the plans",)
+    assert check_plans(problem, robot, {"start_q": rows["start_q"]}) == PlanCheck()
 
 
 def test_float32_is_refused_since_plans_would_miss_their_ends(tmp_path: Path) -> None:

@@ -278,6 +278,18 @@ def test_a_damaged_shard_is_a_warning_of_one_line(run, hits, tmp_path):
     assert run("validate", folder)[0] == 0
 
 
+def test_a_lost_manifest_is_written_again_and_not_passed_over(run, hits, tmp_path):
+    folder = Path(shutil.copytree(hits, tmp_path / "hits"))
+    (folder / "manifest.json").unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        code, out, err = run(*MAKE, folder)
+    assert (code, out) == (0, f"{folder}\n")
+    assert "cnpgen: warning: written again: manifest.json: it was missing, though every shard is there" in err
+    assert "every row was there, manifest.json written again: 200 rows (train 182, validation 18)" in err
+    assert (folder / "manifest.json").read_bytes() == (hits / "manifest.json").read_bytes()
+
+
 def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
     code, out, err = run(*MAKE, tmp_path / "hits", "--dry-run", "--dtype", "float32")
     assert code == 0
@@ -506,6 +518,15 @@ def test_validate_says_yes(run, hits):
     assert "no findings" in out
     assert "recomputed with Pinocchio and Coal: 200 rows, 0 out" in out
     assert err == f"validating {hits}: 200 rows\n"
+
+
+def test_a_quiet_validation_prints_findings_and_nothing_else(run, hits, tmp_path):
+    assert run("validate", hits, "--deep", "--workers", "1", "--regenerate", "1", "--quiet") == (0, "", "")
+    folder = Path(shutil.copytree(hits, tmp_path / "hits"))
+    (folder / "notes.txt").write_text("mine")
+    assert run("validate", folder, "--quiet") == (0, "", "")
+    (folder / "stats.json").unlink()
+    assert run("validate", folder, "--quiet") == (1, "stats.json: is missing\n", "")
 
 
 def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):

@@ -4,6 +4,7 @@ import builtins
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,6 +98,20 @@ def test_a_complete_dataset_that_lost_a_shard_is_damaged(hits, tmp_path):
     found = inspect_dataset(tmp_path / "damaged")
     assert not found.complete
     assert found.state.startswith("damaged: 1 of 2 shards")
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", None])
+@pytest.mark.parametrize("name", ["manifest.json", "stats.json"])
+def test_a_document_that_is_not_as_it_was_written_is_damage(hits, tmp_path, name, content):
+    folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
+    written = (folder / name).read_bytes()
+    (folder / name).write_bytes(written.replace(b'"train"', b'"trian"') if content is None else content)
+    found = inspect_dataset(folder)
+    assert not found.complete
+    assert found.state.startswith(f"damaged: {name}: ")
+    assert found.state.endswith("; 'cnpgen validate' says more")
+    assert found.to_dict()["damage"][0].startswith(f"{name}: ")
+    assert found.rows == {"train": 182, "validation": 18}
 
 
 def test_what_is_no_dataset_is_refused(tmp_path):

@@ -78,6 +78,15 @@ use = "still"
 tolerance = 0.1
 """
 
+URDF = """
+<robot name="arm">
+  <link name="hand"/>
+  <joint name="a" type="revolute"/>
+  <joint name="b" type="revolute"/>
+  <joint name="grip" type="fixed"/>
+</robot>
+"""
+
 PIPELINE = """
 name = "roll"
 title = "Roll a die"
@@ -114,7 +123,7 @@ def _kinds(monkeypatch):
 def files(tmp_path) -> dict[str, Path]:
     """Write a correct problem, pipeline and dataset, laid out as cnpgen ships them."""
     contents = {
-        "urdf": ("problems/arm/arm.urdf", "<robot name='arm'/>"),
+        "urdf": ("problems/arm/arm.urdf", URDF),
         "problem": ("problems/arm/problem.toml", PROBLEM),
         "pipeline": ("pipelines/roll.toml", PIPELINE),
         "dataset": ("datasets/roll-1k.toml", DATASET),
@@ -153,7 +162,7 @@ def test_three_correct_files_load(files):
     assert problem.constraint == (Level(tolerance=0.001), Still(tolerance=0.1))
     assert problem.object is not None
     assert problem.object.size == (0.1, 0.1, 0.2)
-    assert problem.urdf_path.read_text() == "<robot name='arm'/>"
+    assert problem.urdf_path.read_text() == URDF
     assert [part.path.is_absolute() for part in (recipe, recipe.pipeline, problem)] == [True] * 3
 
 
@@ -205,6 +214,15 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
             "obstacle 2.name",
         ),
         ('x = "[0, 1] m"', 'x = "[1, 0] m"', "obstacle 1.x: empty range"),
+        (
+            'x = "[0, 1] m"',
+            'x = "[0 1] m"',
+            "obstacle 1.x: numbers are separated by commas, got '[0 1] m' (did you mean '[0, 1] m'?)",
+        ),
+        ('"a", "b"]', '"a", "bee"]', "robot.joints: arm.urdf has no joint 'bee' that moves"),
+        ('"a", "b"]', '"a", "grip"]', "robot.joints: arm.urdf has no joint 'grip' that moves"),
+        ('tip = "hand"', 'tip = "hnd"', "robot.tip: arm.urdf has no frame 'hnd' (did you mean 'hand'?)"),
+        ('urdf = "arm.urdf"', 'urdf = "arm"', "robot.urdf: no such file: "),
     ],
 )
 def test_a_mistake_in_a_problem_is_reported_with_its_key(files, old, new, mistake):
@@ -212,6 +230,33 @@ def test_a_mistake_in_a_problem_is_reported_with_its_key(files, old, new, mistak
     mistakes = mistakes_of(load_problem, files["problem"])
     assert len(mistakes) == 1
     assert mistakes[0].startswith(mistake)
+
+
+def test_a_mistake_does_not_hide_another_one_that_has_nothing_to_do_with_it(files):
+    edit(files["problem"], "velocity_scale = 0.8", "velocity_scale = 8")
+    edit(files["problem"], '["a", "b"]', '["a", "a", "bee"]')
+    edit(files["problem"], 'tip = "hand"', 'tip = "hnd"')
+    edit(files["problem"], 'x = "[0, 1] m"', 'x = "[1, 0] m"')
+    edit(files["problem"], 'y = "[0, 1] m"', 'y = "[1, 1] m"')
+    edit(files["problem"], 'below = "start"', "")
+    edit(files["problem"], "[limits]", "[trajectory]\npath_control_points = 6\nrate_control_points = 4.5\n[limits]")
+    keys = [mistake.split(":")[0] for mistake in mistakes_of(load_problem, files["problem"])]
+    assert keys == [
+        "robot.joints",
+        "robot.base",
+        "limits.velocity_scale",
+        "obstacle 1.x",
+        "obstacle 1.top",
+        "trajectory.rate_control_points",
+        "trajectory.path_control_points",
+        "robot.joints",
+        "robot.tip",
+    ]
+
+
+def test_a_urdf_that_is_no_xml_is_left_to_whoever_loads_the_robot(files):
+    files["urdf"].write_text("<robot")
+    assert load_problem(files["problem"]).robot.tip == "hand"
 
 
 def test_semantic_mistakes_are_reported_along_with_wrong_types(files):
@@ -265,6 +310,7 @@ def test_a_pipeline_without_stages_is_a_mistake(files, stages):
         (b'name = "arm"\nname = "leg"\n', "line 2: not valid TOML: Cannot overwrite a value"),
         (b'name = "arm"\n[robot\n', "line 2: not valid TOML: "),
         (b'name = "arm"\njoints = [1,', "line 2: not valid TOML: Invalid value"),
+        (b'name = "arm"\nx = [0 1]', "line 2: not valid TOML: Unclosed array (entries are separated by commas)"),
         (b'name = "arm"\ntitle = "\xff"\n', "line 2: not UTF-8: byte 0xff"),
         (b"seed = " + b"9" * 5000, "line 1: not valid TOML: "),
     ],
@@ -385,7 +431,7 @@ def test_reformatting_a_recipe_changes_its_file_digest_and_not_its_identity(file
 def test_a_changed_urdf_changes_every_digest(files):
     before = load_dataset_recipe(files["dataset"])
     identity = recipe_digest(before)
-    files["urdf"].write_text("<robot name='leg'/>")
+    files["urdf"].write_text(URDF.replace('"arm"', '"leg"'))
     after = load_dataset_recipe(files["dataset"])
     assert recipe_digest(after) != identity
     assert after.digest != before.digest

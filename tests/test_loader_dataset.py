@@ -159,6 +159,8 @@ def test_a_dataset_without_training_rows_cannot_be_normalised_by_itself(dataset:
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"plan\.json is missing"):
         load_dataset(tmp_path)
+    with pytest.raises(UsageError, match="nowhere is not there, expected the folder of a dataset"):
+        load_dataset(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut off"])

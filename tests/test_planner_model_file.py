@@ -70,7 +70,7 @@ def test_a_model_that_was_cut_off_is_an_error(model, tmp_path, size):
 
 
 def test_a_missing_file_and_other_files_are_named(tmp_path, tiny):
-    with pytest.raises(DatasetError, match=r"none\.h5 is missing"):
+    with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
         load_model(tmp_path / "none.h5")
     shard = next(tiny("airhockey-hit").rglob("*.h5"))
     with pytest.raises(DatasetError, match="not a model of cnpgen"):

@@ -326,15 +326,15 @@ def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
 
 def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
     for name, content, message in (
-        ("none.h5", None, "is missing"),
         ("text.h5", b"hello", "damaged or cut off"),
         ("empty.h5", b"", "damaged or cut off"),
     ):
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
+        (tmp_path / name).write_bytes(content)
         with pytest.raises(DatasetError, match=rf"{name} is .*{message}|{name} {message}"):
             load_plans(tmp_path / name)
-    with pytest.raises(DatasetError):
+    with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a file of plans"):
+        load_plans(tmp_path / "none.h5")
+    with pytest.raises(UsageError, match="is a folder, expected a file of plans"):
         load_plans(tmp_path)
     with pytest.raises(RecipeError):
         load_plans(write_minimal(tmp_path / "good.h5"), problem="airhokey")

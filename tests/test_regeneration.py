@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen import regeneration
-from cnpgen.regeneration import make_again
+from cnpgen.regeneration import Regeneration, make_again
 from cnpgen.store.plan import REVISION, load_plan, shards
 
 
@@ -25,9 +25,9 @@ def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def problem_of(folder: Path) -> str:
     plan = load_plan(folder)
-    made, identical, findings = make_again(folder, plan, shards(plan)[:1], 3)
-    assert (made, identical) == (1, 0)
-    (finding,) = findings
+    found = make_again(folder, plan, shards(plan)[:1], 3)
+    assert (found.made, found.blocks, found.identical) == (1, 1, 0)
+    (finding,) = found.findings
     return finding.problem
 
 
@@ -48,4 +48,4 @@ def test_other_libraries_are_an_explanation(different, monkeypatch):
 
 def test_the_same_code_makes_the_same_bits(damaged):
     plan = load_plan(damaged)
-    assert make_again(damaged, plan, shards(plan), 2) == (2, 2, [])
+    assert make_again(damaged, plan, shards(plan), 2) == Regeneration(made=2, blocks=4, identical=2)

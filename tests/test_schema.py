@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.schema import Place, Range, field, keys, parse, to_dict
+from cnpgen.parsing import parse
+from cnpgen.schema import Place, Range, field, keys, to_dict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,6 +225,20 @@ def test_a_value_error_of_the_constructor_is_a_mistake():
     assert parse(Picky, {"even": 2}, where=Place("f"), mistakes=mistakes) == Picky(2)
     assert parse(Picky, {"even": 3}, where=Place("f"), mistakes=mistakes) is None
     assert mistakes == ["f: 3 is odd"]
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("load = 200\ncolour = 'gren'", ["colour", "load"]),
+        ("load = 200\nwheel = [{radius = 2}]", ["wheel 1.radius", "load"]),
+        ("load = 200\nbraked = 3", ["braked"]),
+        ("load = 'x'\nbraked = 3", ["braked", "load"]),
+        ("load = 200\nxyzzy = 1", ["xyzzy", "load"]),
+    ],
+)
+def test_what_a_dataclass_checks_itself_is_checked_as_far_as_other_mistakes_let_it(text, keys):
+    assert [mistake.split(": ")[1] for mistake in mistakes_of(text)] == keys
 
 
 def test_a_type_that_recipes_cannot_hold_is_a_mistake():

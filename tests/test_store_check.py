@@ -9,7 +9,7 @@ import h5py
 import pytest
 from test_store_example import PLAN, dataset, make_shard, make_shards
 
-from cnpgen.store.check import MAKE_AGAIN, Finding, check_content, check_dataset, check_documents
+from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, check_dataset, check_documents
 from cnpgen.store.documents import save_document
 from cnpgen.store.files import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
@@ -87,6 +87,9 @@ def test_a_shard_from_another_seed_is_named_as_such(tmp_path: Path, dataset: Pat
     assert message in texts
     assert any(text.startswith(f"{TASK.sidecar}: belongs to another plan") for text in texts)
     assert {item.file for item in check_dataset(dataset)} == {TASK.file, TASK.sidecar}
+    assert {item.advice for item in check_dataset(dataset)} == {MAKE_AGAIN}
+    (dataset / "manifest.json").unlink()
+    assert {item.advice for item in check_dataset(dataset)} == {MAKE_AGAIN}
 
 
 def test_swapped_shards_are_found(dataset: Path) -> None:
@@ -177,8 +180,8 @@ def test_manifests_that_contradict_the_plan_or_themselves_are_found(tmp_path: Pa
 
 
 def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path) -> None:
-    assert check_dataset(tmp_path) == [Finding("plan.json", "is missing")]
-    assert check_dataset(tmp_path / "nowhere") == [Finding("plan.json", "is missing")]
+    assert check_dataset(tmp_path) == [Finding("plan.json", "is missing", advice=REPLACE)]
+    assert check_dataset(tmp_path / "nowhere") == [Finding("plan.json", "is missing", advice=REPLACE)]
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -189,7 +192,7 @@ def test_every_finding_says_what_to_do_and_names_its_file_once(dataset: Path, na
         else:
             (dataset / name).write_bytes(content)
         for item in check_dataset(dataset):
-            assert item.advice or item == Finding("plan.json", "is missing")
+            assert item.advice
             assert name not in item.problem
             assert str(dataset) not in item.problem
 

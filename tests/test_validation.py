@@ -15,6 +15,7 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.library import load_problem
 from cnpgen.make import make_dataset
 from cnpgen.robots.robot import load_robot
+from cnpgen.store.check import MAKE_AGAIN
 from cnpgen.store.files import file_sha256
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize
@@ -98,7 +99,30 @@ def test_a_report_can_be_read_and_stored(tiny: Tiny):
     text = report.summary()
     assert "660 rows, no findings" in text
     assert "recomputed with Pinocchio and Coal: 660 rows, 0 out" in text
-    assert "made again: 1 block, 1 identical to the bit" in text
+    assert "made again: 1 of 4 blocks, 1 identical to the bit" in text
+    assert "plan" not in text
+    assert report.to_dict()["plans"] is None
+
+
+def test_more_blocks_than_there_are_are_all_of_them_and_the_report_says_so(tiny: Tiny):
+    report = validate_dataset(tiny("airhockey-hit"), regenerate=100_000)
+    assert (report.regenerated, report.blocks) == (4, 4)
+    assert "made again: 4 of 4 blocks (100,000 were asked for), 4 identical to the bit" in report.summary()
+    assert report.to_dict()["blocks"] == 4
+
+
+def test_blocks_that_were_asked_for_and_are_not_there_are_not_passed_over(damaged: Path):
+    for shard in damaged.glob("*/*.h5"):
+        shard.unlink()
+    text = validate_dataset(damaged, regenerate=2).summary()
+    assert "made again: 0 of 0 blocks (2 were asked for), 0 identical to the bit" in text
+
+
+def test_every_finding_says_what_to_do_and_no_two_contradict_each_other(damaged: Path, another_seed: Path):
+    shutil.copy(another_seed / "train/shard-00001.h5", damaged / "train/shard-00001.h5")
+    assert {finding.advice for finding in validate_dataset(damaged).findings} == {MAKE_AGAIN}
+    (damaged / "plan.json").unlink()
+    assert "what to do: nothing else says what the dataset was to be" in validate_dataset(damaged).summary()
 
 
 def test_progress_is_told_of_every_shard(tiny: Tiny):

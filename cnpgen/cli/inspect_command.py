@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 _TEXT = """\
-It reads the plan and the records of the shards, not the rows, so that it is as quick for large datasets, and works for
-unfinished ones; whether the rows are what the records say is for 'cnpgen validate' to tell. Of the draws, "accepts" is
-the share that passes a condition of those that got there, "left" the share that is still alive after it of all of them.
+It reads the documents and the records of the shards, not the rows, so that it is as quick for large datasets, and works
+for unfinished ones; whether the rows are what the records say is for 'cnpgen validate' to tell. Of the draws, "accepts"
+is the share that passes a condition of those that got there, "left" the share of all that is still alive after it.
 """
 
 

@@ -129,13 +129,20 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) ->
         all_rows = counted(sum(made.plan.splits.values()), "row")
         text, rest = f"{text}, part {part[0]}/{part[1]} of {all_rows},", rest or "; all parts are made"
     if not made.made:
-        return [f"already {'made' if part else 'complete'}: {text.rstrip(',')}{rest}"]
+        return [f"{_unmade(made, part)}: {text.rstrip(',')}{rest}"]
     share = "" if made.made == wanted else f"the missing {made.made:,} of "
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
     lines = [f"made {share}{text} {times}{rest}"]
     lines += [_yield(meter.outcome)] if meter.outcome else []
     return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
+
+
+def _unmade(made: "MadeDataset", part: tuple[int, int] | None) -> str:
+    """Say in what state a dataset was of which no row had to be made."""
+    if made.mended:
+        return f"every row was there, {', '.join(made.mended)} written again"
+    return f"already {'made' if part else 'complete'}"
 
 
 def _rows_text(rows: "Mapping[str, int]") -> str:

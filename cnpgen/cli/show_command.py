@@ -10,7 +10,7 @@ from cnpgen.errors import RecipeError, UsageError, nearest
 
 if TYPE_CHECKING:
     from cnpgen.describe import Recipe
-    from cnpgen.library import Kind
+    from cnpgen.recipe_files import Kind
 
 KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
 
@@ -74,7 +74,8 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
 
 def _kind(name_or_path: str) -> "Kind":
     """Find out what kind of recipe is meant."""
-    from cnpgen.library import kind_of_file, list_recipes
+    from cnpgen.library import list_recipes
+    from cnpgen.recipe_files import kind_of_file
 
     path = Path(name_or_path)
     if path.is_file():

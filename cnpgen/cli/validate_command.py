@@ -17,10 +17,11 @@ constraints, positions, hits, stored ranges, statistics, counts, and rows that s
 solves blocks of 4096 rows again from the seed: with the backend, the kind of machine and the versions that made the
 dataset every bit is the same; elsewhere rows that agree to rounding (1e-9) are no finding.
 
-On stdout are the findings, one per line, as FILE: PROBLEM, and what was checked. A line that begins with "note:" is
-worth knowing and no finding. Exit codes: 0 nothing was found, 1 there are findings, 2 a wrong argument, 3 this machine
-cannot check it: --regenerate of what compiled kernels have made needs a C compiler, and what plug-ins are part of needs
-them for --deep and --regenerate; without these options nothing but the files is needed.
+On stdout are the findings, one per line, as FILE: PROBLEM, and what was checked; with --quiet the findings only. A line
+that begins with "note:" is worth knowing and no finding. Of a certified dataset --deep judges the plans, too, as
+'cnpgen evaluate' does. Exit codes: 0 nothing was found, 1 there are findings, 2 a wrong argument, 3 this machine cannot
+check it: --regenerate of what compiled kernels have made needs a C compiler, and what plug-ins are part of needs them
+for --deep and --regenerate; without these options nothing but the files is needed.
 """
 
 
@@ -35,9 +36,10 @@ def add(commands: "Commands[Parser]") -> None:
         metavar="K",
         type=values.natural,
         default=0,
-        help="make K random blocks again from the seed and compare them",
+        help="make K random blocks, or all if there are fewer, again from the seed and compare them",
     )
     option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
+    option("--quiet", action="store_true", help="no progress and no summary: nothing at all if nothing is wrong")
     add_json(parser)
 
 
@@ -50,9 +52,11 @@ def run(arguments: argparse.Namespace) -> int:
         print(render(plain(report.to_dict())))
     else:
         for finding in report.findings:
-            note = "note: " if finding.note else ""
-            print(f"{note}{finding.file}: {' '.join(finding.problem.split())}")
-        print(report.summary())
+            if not (finding.note and arguments.quiet):
+                note = "note: " if finding.note else ""
+                print(f"{note}{finding.file}: {' '.join(finding.problem.split())}")
+        if not arguments.quiet:
+            print(report.summary())
     return 0 if report.ok else 1
 
 
@@ -63,7 +67,7 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
     rows = _rows(arguments.folder) if arguments.deep else 0
     if not rows:
         return validate_dataset(arguments.folder, **options)
-    meter = Meter()
+    meter = Meter(quiet=arguments.quiet)
     meter.begin(f"validating {arguments.folder}", rows)
     try:
         return validate_dataset(arguments.folder, **options, progress=meter)

@@ -29,7 +29,8 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
         verify: Compare the sha256 of every shard, once, when it is first read.
 
     Raises:
-        DatasetError: There is no dataset, it is unfinished, or a part of it is missing or damaged.
+        UsageError: There is no such folder.
+        DatasetError: It holds no dataset, it is unfinished, or a part of it is missing or damaged.
         MachineError: The system would not let us read something.
     """
     folder = Path(folder)

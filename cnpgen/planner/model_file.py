@@ -16,6 +16,7 @@ from cnpgen.network.features import BLOCKS, Features
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.sealed import Content, read_sealed, write_sealed
 from cnpgen.plans.problem import ProblemRecord
+from cnpgen.store.places import require_file
 
 KIND, VERSION = "cnpgen-model", 1
 
@@ -40,11 +41,12 @@ def load_model(name_or_path: str | Path) -> Model:
         name_or_path: Name of a shipped model, or path of a model file.
 
     Raises:
-        UsageError: There is no shipped model of this name.
-        DatasetError: The file is missing, damaged, cut off, or no model.
+        UsageError: There is no such file, or no shipped model of this name.
+        DatasetError: The file is damaged, cut off, or no model.
         MachineError: The system would not let us read it.
     """
     path = find_model(name_or_path)
+    require_file(path, "a model")
     return model_from_content(path, read_sealed(path, kind=KIND, version=VERSION))
 
 

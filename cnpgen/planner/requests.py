@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
-from cnpgen.plans.heaps import check_heaps
 from cnpgen.plans.layout import BOUNDARY
 from cnpgen.plans.problem import ProblemRecord
 from cnpgen.store.documents import canonical_sha256
+from cnpgen.store.heaps import opened_foreign_hdf5
+from cnpgen.store.places import require_file
 from cnpgen.store.plan import DatasetPlan
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.shard import opened_hdf5
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -85,11 +85,11 @@ def read_file(path: Path, model: Model) -> Requests:
         model: What will plan for them.
 
     Raises:
-        DatasetError: The file is missing or damaged, lacks something, or says that it is of another problem.
+        UsageError: There is no such file.
+        DatasetError: The file is damaged, lacks something, or says that it is of another problem.
     """
-    if path.is_file():
-        check_heaps(path)
-    with opened_hdf5(path) as file:
+    require_file(path, "a dataset or an HDF5 file of boundary conditions")
+    with opened_foreign_hdf5(path) as file:
         digest = file.attrs.get("problem_sha256")
         found = {name: np.asarray(file[name][()]) for name in (*BOUNDARY, "sample_id") if name in file}
     if isinstance(digest, bytes | str):

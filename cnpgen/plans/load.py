@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.library import load_problem
-from cnpgen.plans.heaps import check_heaps
 from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
-from cnpgen.store.shard import opened_hdf5
+from cnpgen.store.heaps import opened_foreign_hdf5
+from cnpgen.store.places import require_file
 from cnpgen.trajectory.boundary import Boundary
 
 
@@ -30,15 +30,15 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
             in the file; those given here count.
 
     Raises:
-        DatasetError: The file is missing, damaged, not one of plans, or of another problem.
+        UsageError: There is no such file.
+        DatasetError: The file is damaged, not one of plans, or of another problem.
         RecipeError: ``problem`` has mistakes, or the file needs a plug-in that is not installed.
         MachineError: The system would not let us read it.
     """
     path = Path(path)
     wanted = None if problem is None else record_problem(_loaded(problem))
-    if path.is_file():
-        check_heaps(path)
-    with opened_hdf5(path) as file:
+    require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
+    with opened_foreign_hdf5(path) as file:
         attributes = {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
         _check_format(path, attributes)
         columns = _columns(path, file)

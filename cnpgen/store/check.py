@@ -1,7 +1,7 @@
 """The shallow check of a dataset: every file is there, whole, and what the plan says; no row is computed again."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) ->
     try:
         plan = load_plan(folder)
     except DatasetError as error:
-        return [Finding(PLAN, _reason(error, folder / PLAN), advice=REPLACE if (folder / PLAN).exists() else "")]
+        return [Finding(PLAN, _reason(error, folder / PLAN), advice=REPLACE)]
     findings, manifest = _check_manifest(folder, plan)
     entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
     for task in shards(plan):
@@ -165,7 +165,10 @@ def check_shard(folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[st
     damage = _check_file(folder, task.file, *expected)
     if damage and not _is_of_another_plan(path, plan):
         return findings + damage  # what HDF5 makes of a damaged file tells nothing, and may take forever
-    return findings + damage + check_content(folder, plan, task)
+    content = check_content(folder, plan, task)
+    if findings or damage:  # then make-dataset notices by itself that the shard is not the one that it made
+        content = [replace(finding, advice=MAKE_AGAIN) for finding in content]
+    return findings + damage + content
 
 
 def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding]:

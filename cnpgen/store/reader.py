@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, nearest
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
+from cnpgen.store.places import require_folder
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.record import is_committed
 from cnpgen.store.shard import read_shard, storage_dtype
@@ -111,10 +112,12 @@ def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDa
         allow_partial: Open it even if it is unfinished.
 
     Raises:
-        DatasetError: There is no dataset, it is unfinished, or its plan or manifest is damaged.
+        UsageError: There is no such folder.
+        DatasetError: It holds no dataset, it is unfinished, or its plan or manifest is damaged.
         MachineError: The system would not let us read something.
     """
     folder = Path(folder)
+    require_folder(folder)
     plan = load_plan(folder)
     if (folder / MANIFEST).exists():
         manifest = load_manifest(folder)

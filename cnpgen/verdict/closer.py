@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-FINER = 32  # moments between the deepest one and its neighbour: at 1 ms peaks hide up to 0.26 mm, so up to 3 um
+FINER = 32  # moments between two samples: at 1 ms peaks hide up to 0.26 mm, so up to 10 um
+MOST = 256  # intervals between samples that are looked into
 
 
 def look_closer(problem: Problem, world: PathWorld, motion: Motion, samples: Samples, tops: Array) -> list[Margin]:
-    """Measure object contacts between the deepest moment in every obstacle and those before and after it.
+    """Measure object contacts between samples: around the deepest one in every obstacle, and wherever more may hide.
 
     All else that is measured is smooth, so that between two moments it is beyond both by the square of their distance.
 
@@ -40,21 +41,48 @@ def look_closer(problem: Problem, world: PathWorld, motion: Motion, samples: Sam
     constraints = [constraint for constraint in problem.constraint if isinstance(constraint, ObjectContact)]
     if not constraints or not problem.obstacle:
         return []
-    finer = _between(samples, [int(np.argmin(distances)) for distances in world.object_distances()])
-    states = course(motion, finer.s)
+    deepest_valid = -min(constraint.depth + constraint.tolerance for constraint in constraints)
+    finer = _inside(samples, intervals(np.array(world.object_distances()), world.object_corners(), deepest_valid))
+    start_tip, states = world.tip_position[:, 0].copy(), course(motion, finer.s)
     world.set_path(states.q, states.dq, states.ddq, tops)
     return [
-        measure_condition(problem, constraint, condition, world, finer)
+        measure_condition(problem, constraint, condition, finer, start_tip=start_tip)
         for constraint in constraints
         for condition in constraint.measured(cast("World", world))
     ]
 
 
-def _between(samples: Samples, deepest: list[int]) -> Samples:
-    """Choose moments from the one before to the one after each of some."""
-    last = len(samples.s) - 1
-    ends = [(samples.s[max(k - 1, 0)], samples.s[min(k + 1, last)]) for k in deepest]
-    s = np.unique(np.concatenate([np.linspace(low, high, 2 * FINER + 1) for low, high in ends]))
+def intervals(distances: Array, corners: Array, limit: float) -> NDArray[np.intp]:
+    """Choose the intervals between samples that are worth a closer look.
+
+    They are those on both sides of the deepest sample in every obstacle and, unless that decides already, all those in
+    which a distance could fall below the limit: no point of the object is further from where it was than it moves, so
+    that between two samples the distance stays above half of (their sum less the furthest way of a corner).
+
+    Args:
+        distances: Signed distances from every obstacle, or lower bounds of them [m], shape (obstacles, K).
+        corners: Corners of the object [m], shape (8, 3, K).
+        limit: The smallest distance that is still called valid [m].
+
+    Returns:
+        Ascending indices k of intervals from sample k to sample k + 1; of more than ``MOST`` that could hide something,
+        those that could hide most.
+    """
+    count = distances.shape[1] - 1
+    deepest = np.argmin(distances, axis=1)
+    chosen = np.unique(np.clip([deepest - 1, deepest], 0, count - 1))
+    if not distances.min() >= limit:
+        return chosen
+    ways = np.sqrt(np.square(np.diff(corners, axis=2)).sum(axis=1)).max(axis=0)
+    least = (distances[:, :-1] + distances[:, 1:] - ways).min(axis=0) / 2
+    hiding = np.flatnonzero(least < limit)
+    return np.union1d(chosen, hiding[np.argsort(least[hiding], kind="stable")[:MOST]])
+
+
+def _inside(samples: Samples, chosen: NDArray[np.intp]) -> Samples:
+    """Put moments into intervals between samples, their ends included."""
+    ends = zip(samples.s[chosen], samples.s[chosen + 1], strict=True)
+    s = np.unique(np.concatenate([np.linspace(low, high, FINER + 1) for low, high in ends]))
     return Samples(s, np.interp(s, samples.s, samples.t))
 
 

@@ -71,8 +71,9 @@ def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> 
         world: Its robot at the samples.
         samples: When and at which phase they are.
     """
+    start_tip = world.tip_position[:, 0]
     return [
-        measure_condition(problem, constraint, condition, world, samples)
+        measure_condition(problem, constraint, condition, samples, start_tip=start_tip)
         for constraint in problem.constraint
         for condition in constraint.measured(cast("World", world))  # the same questions, answered for K states
         if condition.g
@@ -80,21 +81,26 @@ def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> 
 
 
 def measure_condition(
-    problem: Problem, constraint: Constraint, condition: Condition, world: PathWorld, samples: Samples
+    problem: Problem,
+    constraint: Constraint,
+    condition: Condition,
+    samples: Samples,
+    *,
+    start_tip: Array,
 ) -> Margin:
     """Find where a motion comes closest to breaking a condition, or breaks it most.
 
     Args:
         problem: The problem.
         constraint: One of its constraints.
-        condition: What the constraint measured in ``world``.
-        world: The problem's robot at the samples.
+        condition: What the constraint measured at the samples.
         samples: When and at which phase they are.
+        start_tip: Where the tip is at the start of the motion [m], shape (3,).
     """
     g = np.empty((len(condition.g), len(samples.s)))
     for row, value in zip(g, condition.g, strict=True):
         row[:] = value
-    wider = constraint.funnel(condition, samples.s, world.tip_position[:, 0])
+    wider = constraint.funnel(condition, samples.s, start_tip)
     below, above = condition.lower[:, None] - g, g - condition.upper[:, None]
     excess = np.maximum(below, above) - wider
     allowed = constraint.allowed(condition)

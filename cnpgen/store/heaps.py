@@ -2,13 +2,31 @@
 
 import mmap
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files import machine_error
+from cnpgen.store.shard import opened_hdf5
 
 _BEGIN = b"GCOL\x01\0\0\0"  # of a collection: signature and version; as a number it would be 7e-315
 _HEADER = 16  # bytes, of a collection and of each object in it
+
+
+@contextmanager
+def opened_foreign_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file of which nobody knows whether it is as it was written; see ``opened_hdf5``.
+
+    Raises:
+        DatasetError: The file is missing, damaged or cut off, found out on opening or by what the block reads.
+        MachineError: The system would not let us read it.
+    """
+    if path.is_file():
+        check_heaps(path)
+    with opened_hdf5(path) as file:
+        yield file
 
 
 def check_heaps(path: Path) -> None:

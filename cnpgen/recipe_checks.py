@@ -1,0 +1,59 @@
+"""What a problem file must say that is about several of its tables, or about the URDF beside it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from cnpgen.errors import nearest
+from cnpgen.schema import Place
+from cnpgen.units import show
+
+
+def problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
+    """Check what is about several tables; on the raw ones, so that it is reported along with their own mistakes."""
+    robot = table.get("robot")
+    if isinstance(robot, dict):
+        yield from _robot_mistakes(robot, where / "robot", folder)
+    yield from _repeated(table, where, "constraint", "use")
+    yield from _repeated(table, where, "obstacle", "name")
+    for index, obstacle in tables(table, "obstacle"):
+        if obstacle.get("below") and "object" not in table:
+            yield (where / "obstacle" / index / "below").says("nothing stands on the obstacle: there is no [object]")
+
+
+def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
+    """Check that the URDF is there and has the joints and the tip; all else of it is for Pinocchio to read."""
+    urdf, joints, tip = robot.get("urdf"), robot.get("joints"), robot.get("tip")
+    if not isinstance(urdf, str):
+        return
+    path = folder / urdf
+    if not path.is_file():
+        hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
+        yield (where / "urdf").says(f"no such file: {path}{hint}")
+        return
+    try:
+        tree = ElementTree.parse(path)  # noqa: S314 - a user's own file, and expat expands no external entities
+    except (OSError, ElementTree.ParseError):
+        return
+    moving = [joint.get("name", "") for joint in tree.iter("joint") if joint.get("type", "fixed") != "fixed"]
+    for name in joints if isinstance(joints, list) else ():
+        if isinstance(name, str) and name not in moving:
+            yield (where / "joints").says(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
+    frames = [part.get("name", "") for kind in ("link", "joint") for part in tree.iter(kind)]
+    if isinstance(tip, str) and tip not in frames:
+        yield (where / "tip").says(f"{path.name} has no frame {tip!r}{nearest(tip, frames)}")
+
+
+def _repeated(table: dict[str, Any], where: Place, array: str, key: str) -> Iterator[str]:
+    seen: list[Any] = []
+    for index, entry in tables(table, array):
+        if key in entry and entry[key] in seen:
+            yield (where / array / index / key).says(f"there is a {array} {show(entry[key])} already")
+        seen.append(entry.get(key))
+
+
+def tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:
+    """List the entries of an array of tables that are tables, with their places in it."""
+    entries = table.get(array)
+    return [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)] if isinstance(entries, list) else []

@@ -1,0 +1,64 @@
+"""Recipe files as tables: TOML read, with the line of a mistake, and of which kind a table is."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+Kind = Literal["problem", "pipeline", "dataset"]
+
+MARKS: dict[Kind, set[str]] = {
+    "problem": {"robot", "constraint", "limits"},
+    "pipeline": {"stage", "problem"},
+    "dataset": {"splits", "pipeline"},
+}
+"""Top-level keys that only files of a kind have."""
+
+
+def kind_of_file(path: Path) -> Kind:
+    """Tell the kind of a recipe file by its keys; "dataset" where they do not tell or it cannot be read."""
+    try:
+        table = _toml(path.read_bytes())
+    except (OSError, ValueError):
+        return "dataset"
+    return next((kind for kind in MARKS if is_kind(kind, table)), "dataset")
+
+
+def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> tuple[bytes, dict[str, Any]] | None:
+    """Return the bytes of a recipe file and its top-level table, or None after a mistake."""
+    try:
+        data = path.read_bytes()
+        return data, _expect(kinds, _toml(data))
+    except OSError as error:
+        mistakes.append(f"{path}: cannot be read: {error.strerror}")
+    except ValueError as error:
+        mistakes.append(f"{path}: {error}")
+    return None
+
+
+def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
+    """Return the table unless it is clearly a recipe of another kind."""
+    found = [kind for kind in MARKS if is_kind(kind, table)]
+    if found and not set(found) & set(kinds):
+        raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}")
+    return table
+
+
+def _toml(data: bytes) -> dict[str, Any]:
+    """Parse TOML; a ValueError says in which line it is wrong."""
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ValueError(f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}") from error
+    except (ValueError, RecursionError) as error:
+        found = re.search(r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error))
+        line = int(found[1]) if found and found[1] else len(data.splitlines())
+        text = str(error).replace(found[0], "") if found else str(error)
+        text += " (entries are separated by commas)" if text == "Unclosed array" else ""
+        raise ValueError(f"line {line}: not valid TOML: {text}") from error
+
+
+def is_kind(kind: Kind, table: dict[str, Any]) -> bool:
+    """Whether a top-level table has a key that only recipes of this kind have."""
+    return not MARKS[kind].isdisjoint(table)
