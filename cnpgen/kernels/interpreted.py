@@ -1,6 +1,7 @@
 """Kernels without a compiler: the tape run by NumPy, one operation at a time on blocks of lanes."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Loop, Tape
 
-BLOCK = 4096  # lanes or points; smaller blocks pay more for Python, larger ones fall out of the cache
+BLOCK = 8192  # lanes or points; smaller blocks pay more for Python, larger ones fall out of the cache
 
 
 def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
@@ -28,12 +29,36 @@ _APPLY: dict[str, Callable[..., Any]] = {
     "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or,
     "IF_ELSE_ZERO": _if_else_zero,
 }  # fmt: skip
-_PLAIN = {"TWICE", "IF_ELSE_ZERO"}  # not ufuncs: no casting argument
 
 
 Read = Callable[[int, int], Any]  # component of an argument, for the lanes of a block
 Write = Callable[[int, int, Any], None]  # stores a component of a result
-Step = Callable[[list[Array], Read, Write], None]
+
+
+class _Block:
+    """The rows of a block of lanes, and what reads and writes the lanes that are its turn."""
+
+    def __init__(self, rows: list[Array]) -> None:
+        self.rows = rows
+        self._read: Read
+        self._write: Write
+
+    def run(self, steps: "list[Callable[[], Any]]", read: Read, write: Write) -> None:
+        """Run bound steps."""
+        self._read, self._write = read, write
+        for step in steps:
+            step()
+
+    def load(self, row: int, argument: int, component: int) -> None:
+        """Fill a row with a component of an argument."""
+        np.copyto(self.rows[row], self._read(argument, component))
+
+    def store(self, result: int, component: int, operand: "int | float") -> None:
+        """Store a row, or a number, as a component of a result."""
+        self._write(result, component, self.rows[operand] if isinstance(operand, int) else operand)
+
+
+Bind = Callable[[_Block], Callable[[], Any]]  # binding a step to the rows once halves what Python takes for it
 
 
 class InterpretedKernel(Kernel):
@@ -54,9 +79,12 @@ class InterpretedKernel(Kernel):
     def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
         results = [np.empty((width, n)) for width in self.tape.outputs]
         work = np.empty((self._slots, min(n, BLOCK)))
+        block, steps = _bind_all(self._program, list(work))
         for start in range(0, n, BLOCK):
             lanes = slice(start, min(start + BLOCK, n))
-            _run(self._program, [row[: lanes.stop - start] for row in work], *_lanes(arguments, results, lanes))
+            if lanes.stop - start < work.shape[1]:
+                block, steps = _bind_all(self._program, list(work[:, : lanes.stop - start]))
+            block.run(steps, *_lanes(arguments, results, lanes))
         return results
 
     def _iterate(self, arguments: list[Array], n: int, loop: Loop) -> list[Array]:
@@ -93,8 +121,10 @@ class InterpretedGridKernel(GridKernel):
             for node in range(0, k, many):
                 for lane in range(0, n, BLOCK):
                     nodes, lanes = slice(node, min(node + many, k)), slice(lane, min(lane + BLOCK, n))
-                    rows = [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
-                    _run(self._program, rows, *self._points(arguments, out, nodes, lanes))
+                    block, steps = _bind_all(
+                        self._program, [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
+                    )
+                    block.run(steps, *self._points(arguments, out, nodes, lanes))
 
     def _points(
         self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
@@ -115,9 +145,9 @@ class InterpretedGridKernel(GridKernel):
         return read, write
 
 
-def _run(program: list[Step], rows: list[Array], read: Read, write: Write) -> None:
-    for step in program:
-        step(rows, read, write)
+def _bind_all(program: list[Bind], rows: list[Array]) -> tuple[_Block, list[Callable[[], Any]]]:
+    block = _Block(rows)
+    return block, [bind(block) for bind in program]
 
 
 def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tuple[Read, Write]:
@@ -132,7 +162,7 @@ def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tu
     return read, write
 
 
-def _allocate(tape: Tape) -> tuple[int, list[Step]]:
+def _allocate(tape: Tape) -> tuple[int, list[Bind]]:
     """Assign work rows to values, reusing rows of dead ones, and bind every instruction to its operands."""
     last = np.zeros(len(tape), int)
     names = [NAMES[code] for code in tape.operation]
@@ -142,7 +172,7 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
     free: list[int] = []
     place: dict[int, Any] = {}  # value -> row, or the constant itself
     count = 0
-    program: list[Step] = []
+    program: list[Bind] = []
     for k, name in enumerate(names):
         if name == "CONST":
             place[k] = float(tape.constant[k])  # a Python number: it does not widen float32
@@ -170,26 +200,19 @@ def _operands(tape: Tape, k: int, name: str) -> list[int]:
     return [int(tape.a[k]), int(tape.b[k])][: OPERATIONS[name]]
 
 
-def _bind_input(row: int, argument: int, component: int) -> Step:
-    def step(rows: list[Array], read: Read, _write: Write) -> None:
-        np.copyto(rows[row], read(argument, component))
-
-    return step
+def _bind_input(row: int, argument: int, component: int) -> Bind:
+    return lambda block: partial(block.load, row, argument, component)
 
 
-def _bind_output(operand: Any, result: int, component: int) -> Step:
-    def step(rows: list[Array], _read: Read, write: Write) -> None:
-        write(result, component, rows[operand] if isinstance(operand, int) else operand)
-
-    return step
+def _bind_output(operand: int | float, result: int, component: int) -> Bind:
+    return lambda block: partial(block.store, result, component, operand)
 
 
-def _bind(name: str, operands: list[Any], row: int) -> Step:
+def _bind(name: str, operands: list[Any], row: int) -> Bind:
     apply = _APPLY[name]
-    options = {} if name in _PLAIN else {"casting": "unsafe"}
 
-    def step(rows: list[Array], _read: Read, _write: Write) -> None:
-        values = [rows[operand] if isinstance(operand, int) else operand for operand in operands]
-        apply(*values, out=rows[row], **options)
+    def bind(block: _Block) -> Callable[[], Any]:
+        rows = block.rows
+        return partial(apply, *(rows[each] if isinstance(each, int) else each for each in operands), rows[row])
 
-    return step
+    return bind
