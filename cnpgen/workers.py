@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 import warnings
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 from cnpgen.errors import MachineError, UsageError
 
 _HELD = (signal.SIGINT, signal.SIGTERM)
+_TIDIED = "ignore:resource_tracker:UserWarning"  # as the option -W takes it: the beginning of the message
 WATCH_SECONDS = 0.5  # how often a worker looks whether the process that started it is still there
 
 T = TypeVar("T")
@@ -111,14 +113,22 @@ def _signals_held() -> Iterator[None]:
 
 
 def _start_helpers() -> None:
-    """Start the helper processes that joblib would start otherwise later, unblocking the signals."""
-    with suppress(ImportError, AttributeError):
-        from joblib.externals.loky.backend import resource_tracker as loky_tracker
+    """Start the helper processes that joblib would start otherwise later, unblocking the signals.
 
-        loky_tracker._resource_tracker.ensure_running()
-        from multiprocessing import resource_tracker
+    They tidy up after processes that were killed; they say so on stderr unless their interpreter, which inherits this
+    one's options, ignores it.
+    """
+    sys.warnoptions.append(_TIDIED)
+    try:
+        with suppress(ImportError, AttributeError):
+            from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
-        resource_tracker.ensure_running()
+            loky_tracker._resource_tracker.ensure_running()
+            from multiprocessing import resource_tracker
+
+            resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(_TIDIED)
 
 
 def _record(held: list[int]) -> dict[int, Any]:

@@ -55,6 +55,28 @@ def test_tasks_are_fetched_as_they_are_needed():
     assert len(fetched) < 50
 
 
+KILLED = """
+import os, signal, sys, time
+from cnpgen.workers import share_out
+
+if __name__ == "__main__":
+    for _ in share_out(time.sleep, [0.0, 0.0, 60.0, 60.0], 2):
+        if sys.stdin.readline().strip() == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@linux
+def test_what_a_killed_process_leaves_is_tidied_up_without_a_word():
+    options, pipe = list(sys.warnoptions), subprocess.PIPE
+    command = [sys.executable, "-c", KILLED]
+    with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        said = process.communicate("go on\ndie\n", timeout=60)  # until the helpers are gone, too
+    assert (process.returncode, *said) == (-signal.SIGKILL, "", "")
+    assert not [path for path in Path("/dev/shm").iterdir() if f"loky-{process.pid}-" in path.name]
+    assert sys.warnoptions == options
+
+
 def fail(_task: int) -> None:
     raise ZeroDivisionError("on purpose")
 
