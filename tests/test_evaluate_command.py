@@ -3,6 +3,7 @@
 import json
 import random
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -110,14 +111,38 @@ def test_json_is_complete(run: Run, saved: Callable[[Plans], Path]) -> None:
     assert len(out.splitlines()[-4:]) == 4  # one plan is one line
 
 
-def test_json_of_no_plans_is_json(run: Run, saved: Callable[[Plans], Path]) -> None:
+@pytest.mark.parametrize("words", [("evaluate",), ("evaluate", "--json"), ("refine",), ("export", "--to", "npz")])
+def test_a_file_without_plans_is_the_same_error_for_every_command(
+    saved: Callable[[Plans], Path], capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
     file = saved(plans_of(load("hit")).select(slice(0)))
-    code, out, _ = run(file, "--json")
-    assert json.loads(out)["verdicts"] == []
-    assert code == 1  # there is nothing that could be called valid
-    code, out, _ = run(file)
-    assert code == 1
-    assert "0 plans of airhockey" in out
+    assert main([words[0], str(file), *words[1:]]) == 1
+    out, err = capsys.readouterr()
+    assert (out, one_line(err)) == ("", f"cnpgen: error: no plans in {file}")
+    assert [path.name for path in file.parent.iterdir()] == ["plans.h5"]
+
+
+def test_numbers_of_garbage_do_not_burst_the_table(run: Run, saved: Callable[[Plans], Path]) -> None:
+    plan = load("hit")
+    path = plan.motion.path.copy()
+    path[0, 7] = 1e300
+    code, out, err = run(saved(plans_of(plan.changed(path=path), bent(plan, 1e5))), "--list")
+    assert (code, err) == (1, "")
+    assert max(map(len, out.splitlines())) < 240
+
+
+def test_the_goal_is_where_the_joints_put_the_tip_whatever_a_column_says(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
+    file = saved(plans_of(load("hit"), load("hit")))
+    with h5py.File(file, "a") as content:
+        content["goal_xyz"][1] += [0.3, 0.0, 0.0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        code, out, err = run(file)
+    said = "goal_xyz of 1 plan is not where goal_q puts the tip (the first is plan 1, 0.3 m off): what the joints say"
+    assert (code, err) == (0, f"cnpgen: warning: {file}: {said} counts\n")
+    assert re.search(r"^  at the goal by the paper's rules +2 of 2 ", out, re.M)
 
 
 def test_processes_change_not_a_byte(run: Run, saved: Callable[[Plans], Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -317,6 +317,36 @@ def test_a_changed_problem_is_said(tmp_path: Path) -> None:
         load_plans(tmp_path / "plan.h5")
 
 
+@pytest.mark.parametrize("end", ["start", "goal"])
+def test_tip_positions_of_a_file_are_those_of_its_joints(tmp_path: Path, end: str) -> None:
+    plans = load_plans(write_minimal(tmp_path / "right.h5"))
+    right, other = plans.columns[f"{end}_xyz"], "goal" if end == "start" else "start"
+    stale = right + np.array([[0.0, 0.0, 1e-7], [0.0, 0.2, 0.0], [np.nan, 0.0, 0.0]])
+    file = write_minimal(tmp_path / "stale.h5", **{f"{end}_xyz": stale})
+    with pytest.warns(RuntimeWarning, match=f"{end}_xyz of 2 plans is not where {end}_q puts .* plan 1, 0.2 m off"):
+        found = load_plans(file)
+    np.testing.assert_array_equal(found.columns[f"{end}_xyz"], np.concatenate([stale[:1], right[1:]]))
+    np.testing.assert_array_equal(found.columns[f"{other}_xyz"], plans.columns[f"{other}_xyz"])
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("path_control_points", (2, 15, 6), r"path_control_points must have shape \(3, C, n\) like the other fields"),
+        ("rate_control_points", (2, 20), r"rate_control_points must have shape \(3, R\) "),
+        ("goal_q", (4, 6), r"goal_q must have shape \(3, 6\)"),
+        ("duration", (2,), r"duration must have shape \(3,\), got \(2,\)"),
+        ("loss", (2,), r"loss must have shape \(3,\)"),
+    ],
+)
+def test_the_field_that_does_not_fit_the_others_is_named(
+    tmp_path: Path, name: str, shape: tuple[int, ...], message: str
+) -> None:
+    file = write_minimal(tmp_path / "theirs.h5", **{name: np.ones(shape)})
+    with pytest.raises(DatasetError, match=message):
+        load_plans(file)
+
+
 def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
     with h5py.File(write_minimal(tmp_path / "theirs.h5"), "a") as file:
         file["start_xyz"] = h5py.SoftLink("/nowhere")
@@ -340,6 +370,7 @@ def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
         load_plans(write_minimal(tmp_path / "good.h5"), problem="airhokey")
 
 
+@pytest.mark.filterwarnings("ignore:.* puts the tip:RuntimeWarning")
 def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans(columns={"x": np.ones(N)}))
     content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
@@ -392,6 +423,7 @@ def test_control_points_metres_away_and_a_goal_equal_to_the_start_are_plans(tmp_
     plans = draw_plans()
     plans.path_control_points[0, 5] = 1e6
     plans.boundary.goal_q[1] = plans.boundary.start_q[1]
+    plans.columns["goal_xyz"][1] = plans.columns["start_xyz"][1]
     found = load_after(tmp_path, plans)
     assert not screen(found).any()
     assert_equal(found, plans)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
@@ -52,15 +53,14 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"\n{listing_text(found)}")
     if arguments.plot:
         _draw(found, arguments.plot, arguments.plan)
-    return 0 if len(found.verdicts) and found.valid.all() else 1
+    return 0 if found.valid.all() else 1
 
 
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.errors import UsageError
     from cnpgen.evaluation import evaluate_plans
-    from cnpgen.plans import load_plans
 
-    plans = load_plans(arguments.file, problem=arguments.problem)
+    plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
     meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.plan_files import read_plans
 
 if TYPE_CHECKING:
     from cnpgen.export import Exported
@@ -37,9 +38,8 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.export import export_plans
-    from cnpgen.plans import load_plans
 
-    plans = load_plans(arguments.file)
+    plans = read_plans(arguments.file)
     out = _place(arguments)
     exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=_chosen(plans, arguments))
     for why in exported.refused.values():

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
 
 _TEXT = (
@@ -29,8 +30,6 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.plans import load_plans
-
-    plans = load_plans(arguments.file, problem=arguments.problem)
+    plans = read_plans(arguments.file, problem=arguments.problem)
     out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
     return refine_and_save(arguments, plans, out, title=f"refining {arguments.file}")

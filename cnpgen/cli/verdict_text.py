@@ -19,6 +19,7 @@ METRICS = {  # metric -> what it is called, in a summary and in a list, and its 
     "effort_s": ("effort [s]", "effort [s]", "{:.3f}"),
     "jerk": ("largest jerk [5/s x limit]", "jerk", "{:.2f}"),
 }
+LONG = 1e6  # of any unit: control points that are garbage make metrics of hundreds of digits
 _TALLIES = {
     "valid": "valid",
     "paper_valid": "valid by the paper's rules",
@@ -31,8 +32,6 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     summary, count = found.summary(), len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, looked at every {step} or more often"
-    if not count:
-        return head
     tallies = [
         (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
         for name, text in _TALLIES.items()
@@ -54,6 +53,11 @@ def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ..
     return rows
 
 
+def _figure(form: str, value: float) -> str:
+    """Write a number in its column's form, and one that would not fit into any column in three digits."""
+    return form.format(value) if abs(value) < LONG else f"{value:.3g}"
+
+
 def _severity(verdict: "Verdict") -> float:
     return verdict.worst.severity if verdict.worst else -math.inf
 
@@ -66,7 +70,7 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     for name, (text, _, form) in METRICS.items():
         values = [summary[group].get(name, {}).get(what) for group, what in columns]
         if any(value is not None for value in values):
-            rows.append((text, *("-" if value is None else form.format(value) for value in values), ""))
+            rows.append((text, *("-" if value is None else _figure(form, value) for value in values), ""))
     return rows
 
 
@@ -93,7 +97,8 @@ def listing_text(found: "Evaluation") -> str:
         ("plan", "sample", "verdict", *(METRICS[name][1] for name in shown), "nearest to a bound, or furthest beyond")
     ]
     for index in order:
-        figures = [METRICS[name][2].format(metrics[index][name]) if name in metrics[index] else "-" for name in shown]
+        values = [(METRICS[name][2], metrics[index].get(name)) for name in shown]
+        figures = ["-" if value is None else _figure(form, value) for form, value in values]
         verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
         rows.append((str(index), str(sample), str(verdict.reason), *figures, _worst(verdict.worst)))
     return "\n".join(_columns(rows, left={2, len(rows[0]) - 1}))

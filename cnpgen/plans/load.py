@@ -1,6 +1,8 @@
 """Reading plan files: names, shapes and types are checked, values are not."""
 
+import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,11 @@ from cnpgen.recipes import Problem
 from cnpgen.store.heaps import opened_foreign_hdf5
 from cnpgen.store.places import require_file
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.wording import counted
+
+Array = NDArray[np.float64]
+
+SAME_PLACE = 1e-5  # m: what a tip position may differ by from the one that the joints give, float32 included
 
 
 def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None) -> Plans:
@@ -149,9 +156,7 @@ def _assembled(
     boundary = [columns.pop(name, None) for name in (*BOUNDARY, "goal_ddq")]
     points = columns.pop("path_control_points")
     duration = columns.pop("duration", None)  # stored for others; r decides
-    if duration is not None and duration.shape != points.shape[:1]:
-        raise UsageError(f"duration must have shape {points.shape[:1]}, got {duration.shape}")
-    return make_plans(
+    plans = make_plans(
         record,
         Boundary(*boundary),  # type: ignore[arg-type]
         path_control_points=points,
@@ -161,6 +166,35 @@ def _assembled(
         status=columns.pop("status", None),
         columns=columns,
     )
+    if duration is not None and duration.shape != (len(plans),):
+        raise UsageError(f"duration must have shape {(len(plans),)}, got {duration.shape}")
+    stored = {name: values for name, values in plans.columns.items() if name in columns}
+    return replace(plans, columns={**plans.columns, **_tips(path, plans, stored)})
+
+
+def _tips(path: Path, plans: Plans, stored: Mapping[str, Array]) -> dict[str, Array]:
+    """Put tip positions right that are not where the joints put the tip: both say where obstacles and goals are.
+
+    Args:
+        path: The file, for the warning.
+        plans: The plans.
+        stored: The columns that the file has.
+    """
+    found = {}
+    for end in ("start", "goal"):
+        name, q = f"{end}_xyz", getattr(plans.boundary, f"{end}_q")
+        if name not in stored:
+            continue
+        tip = plans.problem.tip_positions(q)
+        off = np.linalg.norm(stored[name] - tip, axis=1)
+        wrong = ~(off <= SAME_PLACE) & np.isfinite(tip).all(axis=1)
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            text = f"{path}: {name} of {counted(int(wrong.sum()), 'plan')} is not where {end}_q puts the tip"
+            where = f"the first is plan {first}, {off[first]:.3g} m off"
+            warnings.warn(f"{text} ({where}): what the joints say counts", RuntimeWarning, stacklevel=4)
+            found[name] = np.where(wrong[:, None], tip, stored[name])
+    return found
 
 
 def _statuses(path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]) -> NDArray[np.uint8]:

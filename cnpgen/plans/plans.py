@@ -1,5 +1,6 @@
 """Plans: N motions, each for its own boundary conditions, all of one problem."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -99,7 +100,8 @@ def make_plans(
         path_control_points: Control points of p(s) [rad], shape (N, C, n).
         rate_control_points: Control points of r(s) [1/s], shape (N, R).
         degree: Degree of both splines; the problem's by default.
-        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz`` [m] by forward kinematics.
+        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz`` [m] by forward kinematics unless
+            they are given, and then they must be that.
         sample_id: Shape (N,); 0, 1, ... by default.
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
 
@@ -187,7 +189,10 @@ def _mistakes(plans: Plans) -> Iterator[str]:
     if path.ndim != 3:
         yield f"path_control_points must have shape (N, C, n), got {path.shape}"
         return
-    rows, points, n = path.shape
+    _, points, n = path.shape
+    rows = _rows(plans)
+    if len(path) != rows:
+        yield f"path_control_points must have shape ({rows}, C, n) like the other fields, got {path.shape}"
     joints = len(plans.problem.joint_names)
     if n != joints:
         yield f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}"
@@ -205,6 +210,14 @@ def _mistakes(plans: Plans) -> Iterator[str]:
         if getattr(plans, name).shape != (rows,):
             yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
     yield from _column_mistakes(plans, rows)
+
+
+def _rows(plans: Plans) -> int:
+    """Return how many plans most of the fields are about: the others are wrong."""
+    fields = [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
+    fields += [part for part in _parts(plans.boundary) if part is not None]
+    fields += plans.columns.values()
+    return Counter(len(field) if field.ndim else 0 for field in fields).most_common(1)[0][0]
 
 
 def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
