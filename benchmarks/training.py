@@ -28,9 +28,10 @@ from cnpgen.planner.requests import problem_of, read_rows
 from cnpgen.refinement import refine_plans
 from cnpgen.threads import one_thread
 from cnpgen.training import step as parts
+from cnpgen.training.prepare import begin_run, prepare_run
 from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.source import open_source
-from cnpgen.training.train import begin_run, prepare_run, train_model
+from cnpgen.training.train import train_model
 
 DATASETS = ("airhockey-hit", "heavy-object")
 NETWORKS = ((128, 64), (256, 128), (512, 128), (2048, 128))  # width and batch; all have a trunk of five layers

@@ -51,7 +51,7 @@ def architecture_of(given: Surroundings, rows: Rows, settings: TrainingSettings)
 def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
     """A model of a problem with random parameters: plans are bad, but plans."""
     given = surroundings_of(name)
-    kit = make_kit(given, bending_steps=1, slow_down=False)
+    kit = make_kit(given, bending_steps=1, landing_steps=1, slow_down=False)
     rows, features = prepare_rows(boundary, kit.prepare)
     architecture = architecture_of(given, rows, SMALL)
     options = {
@@ -59,7 +59,7 @@ def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: 
         "architecture": architecture,
         "parameters": initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-0.5),
         "features": features,
-        "meaning": Meaning(path_scale=0.3, bending_steps=1),
+        "meaning": Meaning(path_scale=0.3, bending_steps=1, landing_steps=1),
         "rest": resting(boundary),
     }
     return Model(**{**options, **changes})
@@ -68,10 +68,17 @@ def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: 
 def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
     """What one step of training needs, in float32 or float64."""
     given = surroundings_of(name)
-    kit = make_kit(given, bending_steps=settings.bending_steps, slow_down=False)
+    kit = make_kit(
+        given,
+        bending_steps=settings.bending_steps,
+        landing_steps=settings.landing_steps,
+        slow_down=False,
+        gradients=True,
+    )
     rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
     loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
-    return Learner(architecture_of(given, rows, settings), given.problem.trajectory, loss, settings), rows
+    architecture = architecture_of(given, rows, settings)
+    return Learner(architecture, given.problem.trajectory, loss, settings, kit.landing), rows
 
 
 def model_path(folder: Path) -> Path:

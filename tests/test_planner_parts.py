@@ -1,5 +1,7 @@
 """What surrounds the network: a baseline on the manifold, and slowing down as far as limits need it and no further."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -35,7 +37,7 @@ def bent_paths(tiny, dataset: str, name: str, steps: int, count: int = 12) -> np
     """Paths of the baseline alone."""
     given = surroundings_of(name)
     boundary = boundary_of_columns(columns_of(tiny(dataset)), count)
-    tasks = make_kit(given, bending_steps=steps, slow_down=False).prepare(boundary)
+    tasks = make_kit(given, bending_steps=steps, landing_steps=0, slow_down=False).prepare(boundary)
     spec = given.problem.trajectory
     rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
     interior = anchor_line(boundary, rate, spec)
@@ -77,17 +79,14 @@ def test_the_bent_line_moves_no_boundary_control_point(tiny):
 
 
 def test_a_problem_without_equalities_keeps_the_straight_line(tiny):
-    from dataclasses import replace
-
-    from cnpgen.planner.preparation import prepare_tasks
-
     given = surroundings_of("heavy-object")
     free = [each for each in given.problem.constraint if type(each).__name__ != "Vertical"]
     problem = replace(given.problem, constraint=tuple(free))
     kernels = replace(given.kernels, identity="free", arguments={"robot": given.robot, "problem": problem})
-    prepare = prepare_tasks(problem, given.robot, kernels, bending_steps=2)
-    assert prepare.baseline is None
-    assert prepare(boundary_of_columns(columns_of(tiny("heavy-object")), 3)).correction is None
+    surrounding = replace(given, problem=problem, kernels=kernels)
+    kit = make_kit(surrounding, bending_steps=2, landing_steps=1, slow_down=False)
+    assert kit.landing is None
+    assert kit.prepare(boundary_of_columns(columns_of(tiny("heavy-object")), 3)).correction is None
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +95,7 @@ def fast(tiny):
     given = surroundings_of("heavy-object")
     boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 12)
     ends = {f"{end}_xyz": columns_of(tiny("heavy-object"))[f"{end}_xyz"][:12] for end in ("start", "goal")}
-    kit = make_kit(given, bending_steps=1, slow_down=True)
+    kit = make_kit(given, bending_steps=1, landing_steps=0, slow_down=True)
     path = bent_paths(tiny, "heavy-object", "heavy-object", 1)
     tasks = kit.prepare(boundary)
     shape = 0.4 + np.sin(np.pi * np.linspace(0, 1, 20))  # slow at the ends

@@ -2,6 +2,10 @@
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import h5py
@@ -12,6 +16,7 @@ from conftest import columns_of
 from cnpgen.cli.main import main
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
+from cnpgen.plans.status import PlanStatus
 
 SMALL = ["--steps", "40", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--workers", "1"]
 
@@ -43,16 +48,38 @@ def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tm
     assert len(path.with_suffix(".jsonl").read_text().splitlines()) >= 40
     training = load_model(path).training
     assert training["command"] == (
-        "cnpgen train airhockey-hit -o hits.h5 --steps 40 --hidden 16 --layers 2 --batch-size 32"
+        "cnpgen train airhockey-hit -o hits.h5 --steps 40 --hidden 16 --layers 2 --batch-size 32 --check 2"
     )
     assert training["score"]["plans"] == 60
     assert training["dataset"]["rows"] == {"train": 600, "validation": 60}
 
 
 def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
-    code, text = failing(capsys, ["train", str(tiny("airhockey-hit")), "-o", str(trained), *SMALL])
+    words, before = ["train", str(tiny("airhockey-hit")), "-o", str(trained)], trained.read_bytes()
+    assert main([*words, *SMALL]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{trained}\n"
+    assert "already trained: 40 steps" in captured.err
+    code, text = failing(capsys, [*words, *SMALL, "--seed", "3"])
     assert code == 2
-    assert "exists already" in text
+    assert "is another model, it differs in settings.seed (0, now 3)" in text
+    assert trained.read_bytes() == before
+
+
+@pytest.mark.parametrize(("number", "code", "what"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_path, number, code, what):
+    words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL[2:], "--steps", "1e5", "--quiet"]
+    command = [sys.executable, "-m", "cnpgen", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        log = tmp_path / "m.jsonl"
+        while not (log.exists() and log.read_text()) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(getattr(signal, number))
+        out, err = process.communicate(timeout=60)
+    kept = f"{tmp_path / 'm.checkpoint'} keeps the run, run the same command again to go on"
+    assert (process.returncode, out, err) == (code, "", f"cnpgen: {what}: {kept}\n")
+    assert (tmp_path / "m.checkpoint").exists()
 
 
 @pytest.mark.parametrize(
@@ -76,6 +103,39 @@ def test_plans_of_a_dataset_are_for_its_rows(trained, tiny, tmp_path, capsys):
     np.testing.assert_array_equal(plans.columns["hit_speed"], rows["hit_speed"])
     assert main(["evaluate", str(out), "--json"]) in {0, 1}
     assert json.loads(capsys.readouterr().out)["plans"] == 60
+
+
+def test_plans_are_replaced_only_by_force(trained, tiny, tmp_path, capsys):
+    out = tmp_path / "plans.h5"
+    words = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(out), "--n", "3", "--json"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["file"], found["plans"]) == (str(out), 3)
+    code, text = failing(capsys, words)
+    assert code == 2
+    assert "--force replaces it" in text
+    assert main([*words, "--force"]) == 0
+
+
+def test_refined_plans_are_those_of_the_refine_command(trained, tiny, tmp_path, capsys):
+    folder, quiet = str(tiny("airhockey-hit")), ["--quiet", "--workers", "1"]
+    plan = ["plan", folder, "--model", str(trained), "--n", "4"]
+    assert main([*plan, "-o", str(tmp_path / "p.h5"), "--refine", *quiet]) == 0
+    assert main([*plan, "-o", str(tmp_path / "raw.h5")]) == 0
+    assert main(["refine", str(tmp_path / "raw.h5"), "-o", str(tmp_path / "r.h5"), *quiet]) == 0
+    found, expected = load_plans(tmp_path / "p.h5"), load_plans(tmp_path / "r.h5")
+    np.testing.assert_array_equal(found.path_control_points, expected.path_control_points)
+    np.testing.assert_array_equal(found.rate_control_points, expected.rate_control_points)
+    assert (found.status == PlanStatus.VALID).all()
+    assert not (tmp_path / "p.h5.part").exists()
+
+
+@pytest.mark.parametrize("words", [["--workers", "2"], ["--objective", "jerk"], ["--step", "2ms"]])
+def test_options_of_refining_are_not_ignored_without_it(trained, tiny, tmp_path, capsys, words):
+    plan = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(tmp_path / "p.h5"), *words]
+    code, text = failing(capsys, plan)
+    assert code == 2
+    assert f"{words[0]} is for --refine" in text
 
 
 def test_some_rows_of_another_split_can_be_chosen(trained, tiny, tmp_path):

@@ -117,11 +117,64 @@ def test_epochs_become_steps_too(train):
     assert train(steps=None, epochs=2).model.training["steps"] == 2 * (600 // 32)
 
 
-def test_a_model_that_is_there_is_replaced_only_by_force(train):
-    train()
-    with pytest.raises(UsageError, match=r"model\.h5 exists already.*--force"):
+def test_a_finished_model_is_returned_as_it_is_and_another_one_is_replaced_only_by_force(train, tmp_path):
+    first = train()
+    before = (tmp_path / "model.h5").read_bytes()
+    again = train(begin=lambda *_: pytest.fail("trained again"))
+    assert (first.made, again.made) == (True, False)
+    assert again.score == first.model.training["score"]
+    np.testing.assert_array_equal(again.model.parameters, first.model.parameters)
+    for options, differs in (
+        ({"settings": replace(SMALL, seed=1)}, r"settings\.seed \(0, now 1\)"),
+        ({"steps": 31}, r"length\.steps \(30, now 31\)"),
+        ({"check_rows": 3}, r"check_rows \(2, now 3\)"),
+    ):
+        with pytest.raises(UsageError, match=rf"model\.h5 is another model.*{differs}.*--force"):
+            train(**options)
+    assert (tmp_path / "model.h5").read_bytes() == before
+    assert train(steps=31, force=True).model.training["steps"] == 31
+
+
+def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
+    (tmp_path / "model.h5").write_bytes(b"mine")
+    with pytest.raises(UsageError, match=r"model\.h5 exists and is no model.*--force"):
         train()
-    assert train(force=True).model.training["steps"] == STEPS
+    assert (tmp_path / "model.h5").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_the_run_after_the_step_that_it_came_in(train, tmp_path, number):
+    whole = train("whole.h5")
+    before, steps = signal.signal(number, signal.default_int_handler), []
+
+    def interrupt(record: Any) -> None:
+        steps.append(record["step"])
+        if record["step"] == 17:
+            signal.raise_signal(number)
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train("cut.h5", watch=interrupt)
+    finally:
+        signal.signal(number, before)
+    assert steps[-1] == 17
+    begun = []
+    cut = train("cut.h5", begin=lambda state, run: begun.append(state.adam.step))
+    assert begun == [17]
+    np.testing.assert_array_equal(cut.model.parameters, whole.model.parameters)
+    assert lines(cut.model) == lines(whole.model)
+
+
+def test_force_goes_on_with_its_own_checkpoint_and_throws_away_another_one(train):
+    begun = []
+    with pytest.raises(CutOffError):
+        train(force=True, watch=cut_at(15))
+    train(force=True, begin=lambda state, run: begun.append(state.adam.step))
+    with pytest.raises(CutOffError):
+        train(force=True, watch=cut_at(15))
+    train(force=True, steps=31, begin=lambda state, run: begun.append(state.adam.step))
+    assert begun[0] > 0
+    assert begun[1] == 0
 
 
 def test_the_checkpoint_of_another_run_is_not_taken_for_this_one(train):

@@ -6,17 +6,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.refine_options import REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.wording import counted
 
 if TYPE_CHECKING:
     from cnpgen.planner.planner import Planner
     from cnpgen.planner.requests import Requests
+    from cnpgen.plans import Plans
 
 _TEXT = """\
 The problems are rows of a dataset, or boundary conditions in an HDF5 file: start_q and goal_q of shape (N, joints), and
 start_dq, start_ddq and goal_dq where they are not zero. Plans meet them to rounding; whether they meet the constraints
-'cnpgen evaluate' says, and 'cnpgen refine' repairs those that do not. The file of plans is printed on stdout.
+'cnpgen evaluate' says. With --refine they are polished as by 'cnpgen refine', and the exit code is 1 if any is not
+valid in the end; what is finished is in PLANS.part, from where the same command goes on. The file of plans is printed
+on stdout; an existing one is replaced only with --force.
 """
 
 
@@ -34,7 +38,13 @@ def add(commands: "Commands[Parser]") -> None:
         "--other-rows", action="store_true", help="plan for rows that are drawn in another way than the trained ones"
     )
     option("--no-slowing", action="store_true", help="leave motions from rest to rest as fast as the network has them")
-    option("--quiet", action="store_true", help="no summary")
+    option("--force", action="store_true", help="replace PLANS, and throw away another run's PLANS.part")
+    option("--quiet", action="store_true", help="no progress and no summary")
+    add_json(parser)
+    option("--refine", action="store_true", help="polish the plans")
+    refining = parser.add_argument_group("with --refine")
+    refining.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
+    add_refining(refining)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -42,19 +52,42 @@ def run(arguments: argparse.Namespace) -> int:
     import time
 
     from cnpgen.planner.planner import Planner
-    from cnpgen.plans import save_plans
 
+    _check(arguments)
     planner = Planner(arguments.model, slow_down=not arguments.no_slowing)
     requests = _requests(arguments, planner)
     begun = time.perf_counter()
     plans = planner.plan_batch(requests.boundary, sample_id=requests.sample_id, columns=requests.columns)
     seconds = time.perf_counter() - begun
-    save_plans(arguments.out, plans)
     if not arguments.quiet:
         each = 1e6 * seconds / max(len(plans), 1)
         mean = f", mean motion time {plans.duration.mean():.3f} s" if len(plans) else ""
         print(f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms, {each:.0f} us each{mean}", file=sys.stderr)
-    print(arguments.out)
+    if arguments.refine:
+        return refine_and_save(arguments, plans, arguments.out, title=f"refining plans of {arguments.model}")
+    return _save(arguments, plans, seconds)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuse before any work what cannot be meant, or would destroy something."""
+    from cnpgen.errors import UsageError
+
+    default = arguments.parser.get_default
+    lost = [name for name in ("workers", *REFINING) if getattr(arguments, name) != default(name)]
+    if lost and not arguments.refine:
+        raise UsageError(f"--{lost[0].replace('_', '-')} is for --refine, which is missing")
+    check_place(arguments.out, force=arguments.force)
+
+
+def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
+    import json
+
+    from cnpgen.plans import save_plans
+
+    save_plans(arguments.out, plans)
+    duration = float(plans.duration.mean()) if len(plans) else None
+    facts = {"file": str(arguments.out), "plans": len(plans), "seconds": seconds, "mean_duration_s": duration}
+    print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
     return 0
 
 

@@ -5,7 +5,7 @@ import json
 import sys
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, add_json
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refinement import Refinement
 
+REFINING = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")  # what add_refining adds
+WORKERS = "processes; default one per available core"
 LISTED = 10  # plans without success that are listed
 
 TEXT = """\
@@ -28,8 +30,21 @@ plan is valid, and 1 if any is not; the file is written in either case. docs/ref
 
 def add_options(parser: Parser) -> None:
     """Add the options of both commands."""
+    add_refining(parser)
+    parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
+    parser.add_argument(
+        "--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
+    parser.add_argument(
+        "--explain", action="store_true", help="say of every plan that is not valid what is proven about its problem"
+    )
+    add_json(parser)
+
+
+def add_refining(parser: argparse._ActionsContainer) -> None:
+    """Add the options that say how plans are refined: ``REFINING``."""
     option = parser.add_argument
-    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option(
         "--objective",
         choices=("time", "effort", "jerk"),
@@ -43,13 +58,9 @@ def add_options(parser: Parser) -> None:
         "--tolerance",
         metavar="X",
         type=float,
-        default=2e-4,
         help="relative change of the objective at which a plan is finished (default: 2e-4)",
     )
-    option("--step", metavar="S", type=values.seconds, default=1e-3, help="time between two looks (default: 1ms)")
-    option("--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part")
-    option("--quiet", action="store_true", help="no progress and no summary")
-    add_json(parser)
+    option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms)")
 
 
 def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *, title: str) -> int:
@@ -61,14 +72,13 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
         out: Where they go.
         title: What is going on.
     """
-    from cnpgen.cli.notices import notices
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refinement import refine_plans
 
-    names = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")
-    options = RefineOptions(**{name: getattr(arguments, name) for name in names})
-    _check_place(out, force=arguments.force)
+    given = {name: getattr(arguments, name) for name in REFINING}
+    options = RefineOptions(**{name: value for name, value in given.items() if value is not None})
+    check_place(out, force=arguments.force)
     journal = out.with_name(out.name + ".part")
     meter = Meter(quiet=arguments.quiet, noun="plan")
     finished = [0, 0]
@@ -79,16 +89,15 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
         meter.note(f"{finished[1] / finished[0]:.1%} valid")
 
     try:
-        with notices(quiet=arguments.quiet):
-            found = refine_plans(
-                plans,
-                options=options,
-                workers=arguments.workers,
-                journal=journal,
-                discard=arguments.force,
-                begin=lambda total, there: meter.begin(title, total, there),
-                progress=progress,
-            )
+        found = refine_plans(
+            plans,
+            options=options,
+            workers=arguments.workers,
+            journal=journal,
+            discard=arguments.force,
+            begin=lambda total, there: meter.begin(title, total, there),
+            progress=progress,
+        )
     except KeyboardInterrupt as interruption:
         kept = f"{journal} keeps what is finished, run the same command again to go on"
         raise type(interruption)(kept) from interruption
@@ -100,7 +109,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
     return 0 if found.valid.all() else 1
 
 
-def _check_place(out: Path, *, force: bool) -> None:
+def check_place(out: Path, *, force: bool) -> None:
     """Refuse before any work what would fail, or destroy something, after it."""
     from cnpgen.errors import UsageError
 
@@ -111,25 +120,44 @@ def _check_place(out: Path, *, force: bool) -> None:
 
 
 def _tell(arguments: argparse.Namespace, found: "Refinement", out: Path, seconds: float) -> None:
+    facts = found.summary()
+    if arguments.explain:
+        _explain(facts, found)
     if not arguments.quiet:
-        print("\n".join(_summary(found, seconds)), file=sys.stderr)
-    print(json.dumps({"file": str(out), **found.summary()}, indent=2) if arguments.json else out)
+        lines = _summary(facts, seconds, listed=len(found.refined) if arguments.explain else LISTED)
+        print("\n".join(lines), file=sys.stderr)
+    print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
 
 
-def _summary(found: "Refinement", seconds: float) -> list[str]:
+def _explain(facts: dict[str, Any], found: "Refinement") -> None:
+    """Add to the facts about plans that are not valid what is proven about their problems."""
+    from cnpgen.refine.proof import explain_plans
+
+    failures = facts["not_valid"]
+    findings = explain_plans(found.plans, [failure["plan"] for failure in failures])
+    for failure in failures:
+        finding = findings[failure["plan"]]
+        failure |= {"finding": str(finding.kind), "explanation": finding.text}
+
+
+def _summary(facts: dict[str, Any], seconds: float, *, listed: int) -> list[str]:
     """Say in a few lines what came of the plans."""
     from cnpgen.refinement import outcome_text
 
-    facts = found.summary()
     mean = facts["mean_duration_s"]
     lines = [
         f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {seconds:.1f} s"
         + ("" if mean is None else f"; mean motion time {mean:.4f} s")
     ]
     lines += [f"  {count:,} {outcome_text(name)}" for name, count in facts["outcomes"].items()]
-    for failure in facts["not_valid"][:LISTED]:
-        text = f"plan {failure['plan']} (sample {failure['sample_id']}): {failure['reason']}; {failure['outcome']}"
-        lines += textwrap.wrap(text, 110, subsequent_indent="  ")
-    if len(facts["not_valid"]) > LISTED:
-        lines.append(f"... and {len(facts['not_valid']) - LISTED} more: 'cnpgen evaluate' lists them with --list")
+    for failure in facts["not_valid"][:listed]:
+        lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
+    if len(facts["not_valid"]) > listed:
+        lines.append(f"... and {len(facts['not_valid']) - listed} more: 'cnpgen evaluate' lists them with --list")
     return lines
+
+
+def _failure_text(failure: dict[str, Any]) -> str:
+    """Say of one plan why it is not valid, and of its problem what is proven, if that was asked for."""
+    why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
+    return f"plan {failure['plan']} (sample {failure['sample_id']}): {failure['reason']}; {why}"

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 _TEXT = """\
 The loss is the problem's objective and its constraints along every motion; no demonstrations are needed. Beside the
 model there are a log, .jsonl, a picture of it, .png (if matplotlib is installed), and until it is finished a
-checkpoint: after Ctrl-C, kill -9 or a full disk the same command goes on, and gives the bits that it would have given.
-The model that is kept is the best of ten that are judged on validation rows as by 'cnpgen evaluate'. Its file is
-printed on stdout. docs/training.md says how to choose.
+checkpoint: after Ctrl-C (exit code 130) or SIGTERM (143) the same command goes on where it was, after kill -9 or a
+full disk at most a minute before, and gives the bits that it would have given. The model that is kept is the best of
+ten that are judged on validation rows as by 'cnpgen evaluate'. Its file is printed on stdout. docs/training.md says
+how to choose.
 """
 
 
@@ -44,40 +45,56 @@ def add(commands: "Commands[Parser]") -> None:
         choices=("ramped", "fixed", "learned", "bounded"),
         help="weights of the constraints (default: ramped)",
     )
+    option(
+        "--imitate",
+        metavar="X",
+        type=float,
+        help="begin with so large a fraction of the steps, such as 0.1, that imitate the plans of a dataset made with"
+        " --certify (default: 0)",
+    )
     option("--seed", metavar="S", type=values.seed, help="of the first parameters and the order of rows (default: 0)")
     option("--check", metavar="N", type=values.positive, default=200, help="rows to validate on (default: 200)")
     option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
-    option("--force", action="store_true", help="begin again, and replace what is there")
+    option("--force", action="store_true", help="replace MODEL, and throw away another run's checkpoint")
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.training.train import train_model
-
     watch = _Watch(quiet=arguments.quiet)
     try:
-        trained = train_model(
-            arguments.folder,
-            arguments.out,
-            settings=_settings(arguments),
-            steps=arguments.steps,
-            epochs=arguments.epochs,
-            cpu_seconds=arguments.cpu_seconds,
-            check_rows=arguments.check,
-            command=_command(arguments),
-            force=arguments.force,
-            workers=arguments.workers,
-            begin=watch.begin,
-            watch=watch,
-        )
+        trained = _train(arguments, watch)
+    except KeyboardInterrupt as interruption:
+        checkpoint = arguments.out.with_suffix(".checkpoint")
+        kept = f"{checkpoint} keeps the run, run the same command again to go on" if checkpoint.exists() else ""
+        raise type(interruption)(kept) from interruption
     finally:
         watch.close()
-    _draw(trained)
+    if trained.made:
+        _draw(trained)
     if not arguments.quiet:
         print(_summary(trained), file=sys.stderr)
     print(trained.path)
     return 0
+
+
+def _train(arguments: argparse.Namespace, watch: "_Watch") -> "Trained":
+    from cnpgen.training.train import train_model
+
+    return train_model(
+        arguments.folder,
+        arguments.out,
+        settings=_settings(arguments),
+        steps=arguments.steps,
+        epochs=arguments.epochs,
+        cpu_seconds=arguments.cpu_seconds,
+        check_rows=arguments.check,
+        command=_command(arguments),
+        force=arguments.force,
+        workers=arguments.workers,
+        begin=watch.begin,
+        watch=watch,
+    )
 
 
 def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
@@ -87,13 +104,18 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     if arguments.metric is not None:
         given["metric"] = METRICS[arguments.metric]
+    if arguments.imitate is not None:
+        given["imitation"] = arguments.imitate
     return TrainingSettings(**given)
 
 
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
-    names = ("cpu_seconds", "steps", "epochs", "hidden", "layers", "batch_size", "learning_rate", "metric", "seed")
+    lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
+    names = (*lengths, *network, "metric", "imitate", "seed", "check")
+    default = arguments.parser.get_default
     said = [(name.replace("_", "-"), getattr(arguments, name)) for name in names]
+    said = [(name, value) for name, value in said if value != default(name)]
     options = [
         f"--{name} {value:g}" if isinstance(value, float) else f"--{name} {value}" for name, value in said if value
     ]
@@ -120,12 +142,15 @@ class _Watch:
         step = record["step"]
         self._meter(step - self._last)
         self._last = step
+        for name in ("imitation", "loss"):
+            if name in record:
+                self._meter.note(f"{name} {record[name]:.4g}")
         if "loss" in record:
             self._seen = record
-            self._meter.note(f"loss {record['loss']:.4g}")
         if "validation" in record and not self._quiet:
             print(f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}", file=sys.stderr)
-            print(f"  {_terms(self._seen)}", file=sys.stderr, flush=True)
+            if self._seen:
+                print(f"  {_terms(self._seen)}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Remove the bar."""
@@ -165,7 +190,10 @@ def _draw(trained: "Trained") -> None:
 
 def _summary(trained: "Trained") -> str:
     training = trained.model.training
+    words = _words(trained.score)
+    if not trained.made:
+        return f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
     return (
         f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time; the model of step"
-        f" {training['best_step']:,} is kept: {_words(trained.score)}"
+        f" {training['best_step']:,} is kept: {words}"
     )

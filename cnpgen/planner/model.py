@@ -14,7 +14,6 @@ from cnpgen.network.forward import forward
 from cnpgen.network.omega import ControlPoints, control_points
 from cnpgen.network.tasks import Tasks
 from cnpgen.plans.problem import ProblemRecord
-from cnpgen.store.documents import canonical_sha256
 
 Array = NDArray[Any]
 
@@ -26,10 +25,12 @@ class Meaning:
     Attributes:
         path_scale: What the configuration head's output is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line onto the manifold's equalities; none in the paper.
+        landing_steps: Likewise of what the network gave.
     """
 
     path_scale: float
     bending_steps: int
+    landing_steps: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,7 +58,7 @@ class Model:
     log: str = ""
 
     def control_points(self, tasks: Tasks) -> ControlPoints:
-        """Plan N tasks: the network in float32, boundary control points and all sums in float64."""
+        """Plan N tasks, before the landing: the network in float32, boundary control points and all sums in float64."""
         given = forward(self._weights, self.features.of(tasks))
         return control_points(
             tasks,
@@ -75,9 +76,3 @@ class Model:
     def rests(self) -> bool:
         """Whether all of its motions begin and end at rest, so that they may be slowed down."""
         return {"start_dq", "start_ddq", "goal_dq"} <= set(self.rest)
-
-    @cached_property
-    def stages_digest(self) -> str | None:
-        """The sha256 over how its training rows were drawn; None if that is not known."""
-        stages = self.training.get("stages")
-        return None if stages is None else canonical_sha256(stages)

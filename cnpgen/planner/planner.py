@@ -39,7 +39,13 @@ class Planner:
         slow_down = slow_down and self.model.rests
         with surroundings(self.model.problem, backend) as given:
             self.robot = given.robot
-            self._kit = make_kit(given, bending_steps=self.model.meaning.bending_steps, slow_down=slow_down)
+            meaning = self.model.meaning
+            self._kit = make_kit(
+                given,
+                bending_steps=meaning.bending_steps,
+                landing_steps=meaning.landing_steps,
+                slow_down=slow_down,
+            )
 
     def plan(
         self,

@@ -10,7 +10,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.network.tasks import Tasks, expected_time
 from cnpgen.planner.baseline import Baseline, make_baseline
-from cnpgen.planner.expressions import count_equalities, tip_position
+from cnpgen.planner.expressions import tip_position
 from cnpgen.recipes import Problem
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import Boundary
@@ -60,8 +60,7 @@ def prepare_tasks(problem: Problem, robot: "Robot", kernels: KernelLibrary, *, b
         problem: The problem.
         robot: Its robot.
         kernels: Where kernels are loaded from.
-        bending_steps: Gauss-Newton steps of the baseline; 0 leaves it straight.
+        bending_steps: Gauss-Newton steps of the baseline; 0 leaves it straight, as a problem without equalities must.
     """
-    bends = bending_steps > 0 and count_equalities(robot, problem) > 0
-    baseline = make_baseline(problem, kernels, steps=bending_steps) if bends else None
+    baseline = make_baseline(problem, kernels, steps=bending_steps) if bending_steps else None
     return Preparation(problem, robot.velocity_limit, kernels.load(tip_position), baseline)

@@ -1,7 +1,7 @@
 """What is to be planned: rows of a dataset, or a file of boundary conditions; checked against what a model can do."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
+CERTIFIED = "certified-plan"  # the stage that plans every sample
 CONTEXT = ("hit_angle", "hit_speed")  # columns of a dataset that plans keep
 
 
@@ -132,10 +133,15 @@ def _check_problem(where: str, found: ProblemRecord, model: Model) -> None:
         )
 
 
+def _drawing(stages: Iterable[Mapping[str, Any]]) -> str:
+    """Digest of how rows are drawn; that of a certified dataset is the same, only that its rows have plans."""
+    return canonical_sha256([stage for stage in stages if stage.get("use") != CERTIFIED])
+
+
 def _check_stages(folder: Path, plan: DatasetPlan, model: Model) -> None:
     """Refuse rows that are drawn in another way than the training rows."""
     trained = model.training.get("stages")
-    if trained is None or canonical_sha256(trained) == canonical_sha256(list(plan.recipe["pipeline"]["stage"])):
+    if trained is None or _drawing(trained) == _drawing(plan.recipe["pipeline"]["stage"]):
         return
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(

@@ -22,31 +22,45 @@ class Checkpoints:
     Args:
         path: The file.
         identity: What the run is: settings, dataset, steps; JSON-able.
+
+    Attributes:
+        identity: As JSON has it.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
-        self.path, self._identity = path, json.dumps(identity, sort_keys=True)
+        self.path = path
+        self.identity: dict[str, Any] = json.loads(json.dumps(identity))
         self._next = time.monotonic() + EVERY
 
-    def load(self) -> State | None:
+    def load(self, *, discard: bool = False) -> State | None:
         """Return the state that the run was left in; None if it has none.
+
+        Args:
+            discard: Whether what is damaged or of another run is as if it were not there.
 
         Raises:
             DatasetError: The file is damaged, or of another run.
         """
         if not self.path.exists():
             return None
+        try:
+            return self._load()
+        except DatasetError:
+            if discard:
+                return None
+            raise
+
+    def _load(self) -> State:
         content = read_sealed(self.path, kind=KIND, version=VERSION)
         try:
-            found, mine = json.loads(content.texts["identity"]), json.loads(self._identity)
-            state = from_content(content)
+            found, state = json.loads(content.texts["identity"]), from_content(content)
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
-        changed = list(_differences(found, mine))
+        changed = list(differences(found, self.identity))
         if changed:
             raise DatasetError(
                 f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to go"
-                " on with it, or --force to begin again"
+                " on with it, or --force to throw it away"
             )
         return state
 
@@ -62,7 +76,7 @@ class Checkpoints:
             MachineError: The disk is full, read-only or otherwise unwilling.
         """
         begun, content = time.monotonic(), to_content(state)
-        content = replace(content, texts={**content.texts, "identity": self._identity})
+        content = replace(content, texts={**content.texts, "identity": json.dumps(self.identity)})
         write_sealed(self.path, content, kind=KIND, version=VERSION)
         took = time.monotonic() - begun
         self._next = time.monotonic() + min(max(EVERY, SHARE * took), LATEST)
@@ -72,9 +86,10 @@ class Checkpoints:
         self.path.unlink(missing_ok=True)
 
 
-def _differences(found: Any, mine: Any, key: str = "") -> Iterator[str]:
+def differences(found: Any, mine: Any, key: str = "") -> Iterator[str]:
+    """Say where two JSON-able values differ, as dotted keys, with the values if they are short."""
     if isinstance(found, dict) and isinstance(mine, dict):
         for name in [*found, *(name for name in mine if name not in found)]:
-            yield from _differences(found.get(name), mine.get(name), f"{key}.{name}" if key else name)
+            yield from differences(found.get(name), mine.get(name), f"{key}.{name}" if key else name)
     elif found != mine:
         yield f"{key} ({found!r}, now {mine!r})" if len(repr(found)) + len(repr(mine)) < 80 else key

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.network.features import Features, fit_features
+from cnpgen.network.omega import ControlPoints
 from cnpgen.network.tasks import Tasks
 from cnpgen.planner.preparation import Preparation
 from cnpgen.plans.layout import BOUNDARY
@@ -24,18 +25,21 @@ class Rows:
         tasks: The tasks.
         features: The network's inputs, shape (N, F).
         tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
+        shown: Control points of demonstrations; None where there are none.
     """
 
     tasks: Tasks
     features: Array
     tops: Array
+    shown: ControlPoints | None = None
 
     def __len__(self) -> int:
         return len(self.features)
 
     def take(self, which: NDArray[np.intp]) -> "Rows":
         """Return some of the rows."""
-        return Rows(self.tasks.take(which), self.features[which], self.tops[which])
+        shown = None if self.shown is None else ControlPoints(self.shown.path[which], self.shown.rate[which])
+        return Rows(self.tasks.take(which), self.features[which], self.tops[which], shown)
 
 
 def boundary_columns(columns: dict[str, Array]) -> Boundary:

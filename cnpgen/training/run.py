@@ -19,6 +19,7 @@ from cnpgen.training.journal import Journal
 from cnpgen.training.order import Order
 from cnpgen.training.rows import Rows
 from cnpgen.training.schedule import learning_rate
+from cnpgen.training.signals import signals_wait
 from cnpgen.training.state import Best, State, Sums
 from cnpgen.training.step import Learner
 
@@ -75,34 +76,40 @@ class Run:
         Raises:
             MachineError: The loss is not finite any more, or the disk is full.
         """
-        gradient = np.empty_like(state.adam.parameters)
         if state.metric:
             self.metric.load_state(state.metric)
+        gradient = np.empty_like(state.adam.parameters)
         while state.adam.step < state.steps:
-            begun = time.process_time()
-            self.step(state, gradient)
-            state.seconds += time.process_time() - begun
-            for record in self._due(state):
-                journal.write(record)
-                if watch is not None:
-                    watch(record)
-            checkpoints.save_now_and_then(state)
+            with signals_wait() as waiting:
+                while state.adam.step < state.steps and waiting.number is None:
+                    self._go_on(state, gradient, journal, watch)
+                    checkpoints.save_now_and_then(state)
+                if waiting.number is not None:
+                    checkpoints.save(state)
+
+    def _go_on(self, state: State, gradient: Array, journal: Journal, watch: Watcher | None) -> None:
+        """Take a step, with all that is due after it."""
+        begun = time.process_time()
+        self.step(state, gradient)
+        state.seconds += time.process_time() - begun
+        for record in self._due(state):
+            journal.write(record)
+            if watch is not None:
+                watch(record)
 
     def model(self, parameters: Array, *, log: str = "", training: Mapping[str, Any] | None = None) -> Model:
-        """Make a model of parameters.
-
-        Args:
-            parameters: Shape (n_parameters,).
-            log: The training log.
-            training: What is added to what the model says of how it was made.
-        """
+        """Make a model of parameters; ``training`` is added to what it says of how it was made."""
         settings = self.learner.settings
         return Model(
             problem=self.problem,
             architecture=self.learner.architecture,
             parameters=parameters.astype(np.float32),
             features=self.features,
-            meaning=Meaning(path_scale=settings.path_scale, bending_steps=settings.bending_steps),
+            meaning=Meaning(
+                path_scale=settings.path_scale,
+                bending_steps=settings.bending_steps,
+                landing_steps=settings.landing_steps,
+            ),
             rest=self.rest,
             training={**self.training, **(training or {})},
             log=log,
@@ -116,18 +123,27 @@ class Run:
             gradient: Scratch, shape (n_parameters,).
         """
         adam, step = state.adam, state.adam.step
-        progress = step / state.steps
+        rows = self.rows.take(self.order.batch(step))
+        if step < state.imitating:
+            distances = self.learner.imitation_gradient(adam.parameters, rows, clipping=state.clipping, out=gradient)
+            state.sums.add_distances(distances)
+        else:
+            self._gradient(state, rows, gradient)
+        self.learner.update(adam, state.clipping, gradient, rate=self._rate(state, step))
+
+    def _gradient(self, state: State, rows: Rows, gradient: Array) -> None:
+        """Write the gradient of the loss; the metric observes what the plans of the batch cost."""
+        progress = state.progress(state.adam.step)
         terms = self.learner.gradient(
-            adam.parameters,
-            self.rows.take(self.order.batch(step)),
+            state.adam.parameters,
+            rows,
             self.metric.weights(progress),
-            shift=rotating_shift(step * STRIDE, self.learner.settings.shifts),
+            shift=rotating_shift(state.adam.step * STRIDE, self.learner.settings.shifts),
             clipping=state.clipping,
             out=gradient,
         )
-        self.learner.update(adam, state.clipping, gradient, rate=self._rate(state, step))
         self.metric.observe(terms, progress)
-        if adam.step % self.order.batches == 0:
+        if (state.adam.step + 1) % self.order.batches == 0:
             self.metric.end_epoch(progress)
         state.metric = self.metric.state()
         state.sums.add(terms)
@@ -150,21 +166,26 @@ class Run:
     def _progress(self, state: State) -> dict[str, Any]:
         """Say what the terms were since the last line."""
         sums, step = state.sums, state.adam.step
+        state.sums = Sums(np.zeros_like(sums.terms))
         if sums.lost > sums.steps * self.order.batch_size // 2:
             raise MachineError(f"the loss of most plans is not finite at step {step}: try a smaller --learning-rate")
-        means = sums.terms / sums.steps
-        weights = self.metric.weights((step - 1) / state.steps)
-        state.sums = Sums(np.zeros_like(sums.terms))
         return {
             "step": step,
             "epoch": round(step / self.order.batches, 3),
             "learning_rate": self._rate(state, step - 1),
             "seconds": round(state.seconds, 2),
+            **({"imitation": sums.distance / sums.imitating} if sums.imitating else {}),
+            **(self._means(state, sums) if sums.steps else {}),
+            "lost": sums.lost,
+        }
+
+    def _means(self, state: State, sums: Sums) -> dict[str, Any]:
+        means, weights = sums.terms / sums.steps, self.metric.weights(state.progress(state.adam.step - 1))
+        return {
             "loss": float(means[0] + means[1:] @ weights),
             "terms": dict(zip(self.names, means.tolist(), strict=True)),
             "weights": dict(zip(self.names[1:], weights.tolist(), strict=True)),
             "budgets": dict(self.budgets),
-            "lost": sums.lost,
         }
 
     def _check(self, state: State) -> dict[str, Any]:

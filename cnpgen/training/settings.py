@@ -7,7 +7,7 @@ from cnpgen.losses.schedule import BOUNDED, PUBLISHED, MetricSettings
 
 METRICS = {
     "fixed": MetricSettings(kind="fixed"),
-    "ramped": MetricSettings(kind="ramped"),
+    "ramped": MetricSettings(),
     "learned": PUBLISHED,
     "bounded": BOUNDED,
 }
@@ -29,12 +29,14 @@ class TrainingSettings:
         head_scale: Factor of the heads' first weights.
         rate_bias: Logarithm of the first guess of expected time over duration.
         bending_steps: Gauss-Newton steps that bend the baseline onto the manifold.
+        landing_steps: Likewise of what the network gives.
         nodes: Quadrature nodes of the loss.
         shifts: So many shifted sets of nodes are used in turn, so that nothing hides between them.
         sample_clip: Largest norm of a sample's gradient, in running medians.
         batch_clip: Largest norm of a batch's gradient, in running norms.
         memory: Of the average of the parameters.
         metric: How the weights of the constraint terms change.
+        imitation: Fraction of the run, at its beginning, that imitates the plans of a certified dataset.
     """
 
     hidden: int = 128
@@ -48,12 +50,14 @@ class TrainingSettings:
     head_scale: float = 0.1
     rate_bias: float = -0.5
     bending_steps: int = 1
+    landing_steps: int = 1
     nodes: int = 32
     shifts: int = 16
     sample_clip: float = 30.0
     batch_clip: float = 2.0
     memory: float = 0.999
-    metric: MetricSettings = field(default=METRICS["ramped"])
+    metric: MetricSettings = field(default_factory=MetricSettings)
+    imitation: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("hidden", "layers", "batch_size", "nodes", "shifts"):
@@ -62,6 +66,8 @@ class TrainingSettings:
         for name in ("learning_rate", "path_scale", "sample_clip", "batch_clip"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"{name} must be above 0, got {getattr(self, name)}")
+        if not 0 <= self.imitation < 1:
+            raise UsageError(f"imitation must be at least 0 and below 1, got {self.imitation}")
 
 
 @dataclass(frozen=True, kw_only=True)

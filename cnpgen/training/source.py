@@ -7,10 +7,13 @@ from typing import Any
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
+from cnpgen.network.omega import ControlPoints
 from cnpgen.plans.layout import BOUNDARY
 from cnpgen.store.plan import DatasetPlan
 from cnpgen.training.rows import boundary_columns
 from cnpgen.trajectory.boundary import Boundary
+
+DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a certified dataset
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,14 @@ class Source:
             return boundary_columns(dataset.arrays(split, fields=names, dtype="float64"))
         count = min(rows, dataset.splits[split])
         return boundary_columns(dataset.rows(split, list(range(count)), fields=names, dtype="float64"))
+
+    def demonstrations(self, joints: int) -> ControlPoints | None:
+        """Read the plans of a certified dataset's training rows; None if it has none."""
+        if not set(DEMONSTRATION) <= set(self.dataset.fields):
+            return None
+        found = self.dataset.arrays(self.train, fields=DEMONSTRATION, dtype="float32")
+        path, rate = (found[name] for name in DEMONSTRATION)
+        return ControlPoints(path.reshape(len(path), -1, joints), rate)
 
     def describe(self) -> dict[str, Any]:
         """Say which rows these are, for the model's file."""

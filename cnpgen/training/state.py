@@ -24,11 +24,20 @@ class Sums:
         terms: Sum over steps of the terms' means, shape (1 + m,).
         steps: Number of steps.
         lost: Plans whose loss was not finite.
+        distance: Sum over imitating steps of the mean distance from demonstrations.
+        imitating: Number of imitating steps, which are not among ``steps``.
     """
 
     terms: Array
     steps: int = 0
     lost: int = 0
+    distance: float = 0.0
+    imitating: int = 0
+
+    def add_distances(self, distances: Array) -> None:
+        """Add what a batch of imitating plans is off, shape (N, 1)."""
+        self.distance += float(distances.mean(dtype=np.float64))
+        self.imitating += 1
 
     def add(self, terms: Array) -> None:
         """Add the terms of a batch, shape (N, 1 + m); plans without a loss are counted and left out."""
@@ -64,6 +73,7 @@ class State:
         adam: Parameters and moments.
         clipping: Running sizes of gradients.
         steps: Steps of the whole run.
+        imitating: How many of them, at the beginning, imitate.
         metric: State of the metric, JSON-able.
         sums: For the log.
         best: The best model so far.
@@ -76,21 +86,27 @@ class State:
     sums: Sums
     best: Best
     steps: int
+    imitating: int = 0
     metric: Mapping[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     checking: float = 0.0
 
+    def progress(self, step: int) -> float:
+        """Return how much of the run is done at a step, without the part that imitates; in [0, 1]."""
+        return max(step - self.imitating, 0) / (self.steps - self.imitating)
 
-def start_state(parameters: Array, *, terms: int, steps: int) -> State:
+
+def start_state(parameters: Array, *, terms: int, steps: int, imitation: float = 0.0) -> State:
     """Begin a run.
 
     Args:
         parameters: The first parameters.
         terms: Number of the loss's terms.
         steps: Steps of the whole run.
+        imitation: Fraction of them that imitate.
     """
     best = Best(-math.inf, 0, parameters.copy())
-    return State(start_adam(parameters), Clipping(), Sums(np.zeros(terms)), best, steps)
+    return State(start_adam(parameters), Clipping(), Sums(np.zeros(terms)), best, steps, int(imitation * steps))
 
 
 def to_content(state: State) -> Content:
@@ -100,9 +116,10 @@ def to_content(state: State) -> Content:
     numbers = {
         "step": adam.step,
         "steps": state.steps,
+        "imitating": state.imitating,
         "clipping": asdict(state.clipping),
         "metric": dict(state.metric),
-        "sums": {"steps": state.sums.steps, "lost": state.sums.lost},
+        "sums": {name: value for name, value in vars(state.sums).items() if name != "terms"},
         "best": {"score": best.score, "step": best.step},
         "seconds": state.seconds,
         "checking": state.checking,
@@ -128,6 +145,7 @@ def from_content(content: Content) -> State:
         Sums(np.array(arrays["terms"]), **numbers["sums"]),
         Best(best["score"], best["step"], np.array(arrays["best"])),
         numbers["steps"],
+        numbers["imitating"],
         numbers["metric"],
         numbers["seconds"],
         numbers["checking"],

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from cnpgen.losses.value import LossValue
 from cnpgen.network.architecture import Architecture
 from cnpgen.network.forward import backward, forward
-from cnpgen.network.omega import control_points, pull_back
+from cnpgen.network.omega import ControlPoints, control_points, pull_back
+from cnpgen.planner.landing import Landing
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.training.adam import Adam
 from cnpgen.training.clipping import Clipping
+from cnpgen.training.imitation import imitation_loss
 from cnpgen.training.rows import Rows
 from cnpgen.training.settings import TrainingSettings
 
@@ -32,12 +34,14 @@ class Learner:
         spec: Degree and numbers of control points.
         loss: The loss.
         settings: The settings.
+        landing: What bends the network's plans onto the manifold; None where nothing does.
     """
 
     architecture: Architecture
     spec: TrajectorySpec
     loss: Loss
     settings: TrainingSettings
+    landing: Landing | None = None
 
     def gradient(
         self, parameters: Array, rows: Rows, weights: Array, *, shift: float, clipping: Clipping, out: Array
@@ -55,21 +59,45 @@ class Learner:
         Returns:
             The terms of every sample, shape (N, 1 + m).
         """
+
+        def cost(points: ControlPoints) -> LossValue:
+            start_tip = rows.tasks.start_xyz
+            return self.loss(
+                points.path, points.rate, weights=weights, tops=rows.tops, start_tip=start_tip, shift=shift
+            )
+
+        return self._gradient(parameters, rows, cost, clipping, out)
+
+    def imitation_gradient(self, parameters: Array, rows: Rows, *, clipping: Clipping, out: Array) -> Array:
+        """Write the gradient of the mean distance of a batch from its demonstrations; see ``gradient``.
+
+        Returns:
+            The distance of every sample, shape (N, 1).
+        """
+        shown = rows.shown
+        assert shown is not None
+        return self._gradient(parameters, rows, lambda points: imitation_loss(points, shown), clipping, out)
+
+    def _gradient(
+        self,
+        parameters: Array,
+        rows: Rows,
+        cost: Callable[[ControlPoints], LossValue],
+        clipping: Clipping,
+        out: Array,
+    ) -> Array:
         network = self.architecture.split(parameters)
         given = forward(network, rows.features)
         scale, spec = self.settings.path_scale, self.spec
         points = control_points(rows.tasks, given.path, given.log_rate, scale=scale, spec=spec)
-        value = self.loss(
-            points.path,
-            points.rate,
-            weights=weights,
-            tops=rows.tops,
-            shift=shift,
-        )
+        value = cost(self._landed(points, rows))
+        by_path = value.path_gradient.astype(parameters.dtype, copy=False)
+        if self.landing is not None:
+            by_path = self.landing.pull_back(points.path, rows.tops, by_path)
         phi, log_rate = pull_back(
             rows.tasks,
             points,
-            path_gradient=value.path_gradient.astype(parameters.dtype, copy=False),
+            path_gradient=by_path,
             rate_gradient=value.rate_gradient.astype(parameters.dtype, copy=False),
             scale=scale,
             spec=spec,
@@ -77,9 +105,13 @@ class Learner:
         factors = self._factors(phi, log_rate, clipping)
         phi *= factors
         log_rate *= factors
-        gradient = self.architecture.split(out)
-        backward(network, given, path_gradient=phi, log_rate_gradient=log_rate, out=gradient)
+        backward(network, given, path_gradient=phi, log_rate_gradient=log_rate, out=self.architecture.split(out))
         return value.terms
+
+    def _landed(self, points: ControlPoints, rows: Rows) -> ControlPoints:
+        if self.landing is None:
+            return points
+        return ControlPoints(self.landing.land(points.path, rows.tops), points.rate)
 
     def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
         """Return what the gradient of every sample is multiplied by, shape (N, 1); one that is not finite becomes 0."""

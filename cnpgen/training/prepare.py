@@ -1,0 +1,148 @@
+"""Setting a run up: rows, kernels, loss and network; how many steps it has."""
+
+import time
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from cnpgen import __version__
+from cnpgen.errors import UsageError
+from cnpgen.losses.metric import Metric
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.losses.schedule import suggested_weights
+from cnpgen.network.architecture import Architecture, initial_parameters
+from cnpgen.planner.kit import Kit, Surroundings, make_kit
+from cnpgen.store.documents import plain
+from cnpgen.training.margins import suggested_margins
+from cnpgen.training.rows import Rows, prepare_rows, resting
+from cnpgen.training.run import Run
+from cnpgen.training.settings import Length, TrainingSettings
+from cnpgen.training.source import Source, stages_of
+from cnpgen.training.state import State, start_state
+from cnpgen.training.step import Learner
+from cnpgen.training.validation import validate
+from cnpgen.trajectory.boundary import Boundary
+
+WARMING, TIMED = 10, 50  # steps taken to find out how long one takes
+
+
+def prepare_run(
+    source: Source, given: Surroundings, settings: TrainingSettings, *, check_rows: int = 200, command: str = ""
+) -> tuple[Run, Kit]:
+    """Load rows, kernels and loss; set up the network.
+
+    Args:
+        source: The dataset.
+        given: Its problem.
+        settings: How to train.
+        check_rows: Validation rows that models are compared by.
+        command: What the model says that it was made by.
+
+    Returns:
+        The run, and the kit that plans are made with.
+
+    Raises:
+        UsageError: Plans are to be imitated, and the dataset has none.
+    """
+    boundary = source.boundary(source.train)
+    rest = resting(boundary)
+    kit = make_kit(
+        given,
+        bending_steps=settings.bending_steps,
+        landing_steps=settings.landing_steps,
+        slow_down=len(rest) == 3,  # all of them
+        gradients=True,
+    )
+    rows, features = prepare_rows(boundary, kit.prepare)
+    if settings.imitation:
+        rows = _with_demonstrations(rows, source, given)
+    loss = _loss(given, settings)
+    weights = loss.weights0 if settings.metric.kind == "learned" else suggested_weights(loss.terms, loss.weights0)
+    held_out = source.boundary(source.validation, check_rows)
+    architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
+    run = Run(
+        learner=Learner(architecture, given.problem.trajectory, loss, settings, kit.landing),
+        names=loss.terms,
+        budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
+        rows=rows,
+        features=features,
+        metric=Metric(weights, loss.budgets, settings.metric),
+        problem=given.record,
+        validate=lambda model: validate(model, kit, held_out),
+        rest=rest,
+        training={
+            "command": command,
+            **identity(source, settings),
+            "stages": stages_of(source.dataset.plan),
+        },
+    )
+    return run, kit
+
+
+def identity(source: Source, settings: TrainingSettings) -> dict[str, Any]:
+    """Say what, beside its length, distinguishes one run from another; JSON-able."""
+    return {"cnpgen": __version__, "dataset": source.describe(), "settings": plain(asdict(settings))}
+
+
+def _with_demonstrations(rows: Rows, source: Source, given: Surroundings) -> Rows:
+    shown = source.demonstrations(given.robot.n)
+    if shown is None:
+        raise UsageError(
+            f"{source.dataset.folder} holds no plans that could be imitated: make it with 'cnpgen make-dataset"
+            " --certify', or train without imitation"
+        )
+    return replace(rows, shown=shown)
+
+
+def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Boundary, *, inputs: int) -> Architecture:
+    spec = given.problem.trajectory
+    return Architecture(
+        inputs=inputs,
+        hidden=settings.hidden,
+        layers=settings.layers,
+        path_outputs=given.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),
+        rate_outputs=spec.rate_control_points,
+    )
+
+
+def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
+    backend = given.kernels.backend
+    names = PlanLoss(given.problem, nodes=settings.nodes, backend=backend).terms  # its kernels are built when needed
+    return PlanLoss(given.problem, nodes=settings.nodes, backend=backend, margins=suggested_margins(names))
+
+
+def begin_run(run: Run, length: Length) -> State:
+    """Start a run; find out how many steps it has."""
+    if length.steps is not None:
+        steps = length.steps
+    elif length.epochs is not None:
+        steps = max(round(length.epochs * run.order.batches), 1)
+    else:
+        assert length.cpu_seconds is not None
+        steps = max(int(length.cpu_seconds / _step_seconds(run)), 1)
+    return _fresh(run, steps)
+
+
+def _fresh(run: Run, steps: int) -> State:
+    settings = run.learner.settings
+    parameters = initial_parameters(
+        run.learner.architecture,
+        seed=settings.seed,
+        head_scale=settings.head_scale,
+        rate_bias=settings.rate_bias,
+    )
+    return start_state(parameters, terms=len(run.names), steps=steps, imitation=settings.imitation)
+
+
+def _step_seconds(run: Run) -> float:
+    """Measure how long a step takes [s of CPU time], on a state that is thrown away."""
+    state, metric = _fresh(run, 10_000), run.metric.state()
+    state.imitating = 0
+    gradient, times = np.empty_like(state.adam.parameters), []
+    for _ in range(WARMING + TIMED):
+        begun = time.process_time()
+        run.step(state, gradient)
+        times.append(time.process_time() - begun)
+    run.metric.load_state(metric)
+    return float(np.mean(times[WARMING:]))
