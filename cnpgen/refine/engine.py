@@ -79,9 +79,7 @@ def load_refiner(
 
     backend, cache_folder = choose_backend(None)
     kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})
-    settings = Settings(cost_tolerance=options.tolerance)
-    if options.max_iterations is not None:
-        settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+    settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
     return Refiner(
         problem,
         robot,

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from cnpgen.errors import UsageError, nearest
+from cnpgen.refine import sqp
 from cnpgen.refine.criterion import OBJECTIVES
 from cnpgen.verdict.judge import check_step
 
@@ -18,7 +19,7 @@ class RefineOptions:
             time.
         weight: Weight of what is minimised beside the time; by default the problem's, or 1 for effort and jerk.
         solver: "own": sequential quadratic programming with DAQP; "ipopt" and "sqpmethod" are CasADi's.
-        max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down. By default the solver's.
+        max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down.
         tolerance: Relative change of the objective below which a feasible iterate is optimal.
         step: The verdict looks at moments no further apart than this [s].
 
@@ -29,8 +30,8 @@ class RefineOptions:
     objective: str = "time"
     weight: float | None = None
     solver: str = "own"
-    max_iterations: int | None = None
-    tolerance: float = 2e-4
+    max_iterations: int = sqp.DEFAULT.max_iterations
+    tolerance: float = sqp.DEFAULT.cost_tolerance
     step: float = 1e-3
 
     def __post_init__(self) -> None:
@@ -41,7 +42,7 @@ class RefineOptions:
                 )
         if self.weight is not None and not 0 <= self.weight < float("inf"):
             raise UsageError(f"the weight of an objective must be a number that is not negative, got {self.weight}")
-        if self.max_iterations is not None and self.max_iterations < 0:
+        if self.max_iterations < 0:
             raise UsageError(f"max_iterations must not be negative, got {self.max_iterations}")
         check_step(self.step)
         if not 0 < self.tolerance < 1:

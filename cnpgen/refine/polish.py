@@ -70,7 +70,7 @@ class _Search:
         return min(self.judged, key=lambda each: each.rank)
 
     def may_be_better(self, path: Array, rate: Array, best: Refined) -> bool:
-        """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted at once."""
+        """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted."""
         if not best.valid:
             return True
         cost = self.refiner.check.transcription(self.task).objective(path, rate)

@@ -1,4 +1,4 @@
-"""Sequential quadratic programming with a trust region and DAQP, for one motion.
+"""Sequential quadratic programming with a trust region, for one motion.
 
 Each step minimises a quadratic model of the objective subject to the linearised residuals. Violated residuals are
 relaxed by one elastic variable: the step may leave the fraction ``beta`` of every violation. The merit function is
@@ -11,13 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.refine.quadratic import Mask, Model, Step, choose
 from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
-INFINITE = 1e30
-ELASTIC = 1e-2  # curvature of the elastic variable's cost; far smaller ones triple the working-set changes
+RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
+LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
+WIDE = 0.15  # trust radius of a start that is not near a solution
 LEAP = 1.5  # the next step may be longer than the last one by this factor
+NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the first, residuals this near are held
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
+ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,6 @@ class Settings:
         cost_tolerance: Relative change of the objective below which a feasible iterate is optimal.
         violation_tolerance: Worst scaled violation of a feasible iterate.
         thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
-        qp_iterations: Largest number of working-set changes in one quadratic programme.
     """
 
     max_iterations: int = 40
@@ -42,7 +45,6 @@ class Settings:
     cost_tolerance: float = 2e-4
     violation_tolerance: float = 6e-4
     thin: int = 6
-    qp_iterations: int = 3000
 
 
 DEFAULT = Settings()
@@ -60,7 +62,7 @@ class Bounds:
 
     lower: Array
     upper: Array
-    sharp: NDArray[np.bool_]
+    sharp: Mask
 
     def excess(self, g: Array) -> Array:
         """How far residuals g are outside, shape (K, m); negative inside."""
@@ -98,130 +100,87 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
         x: First variables, shape (nx,).
         settings: How to iterate.
     """
-    scale = np.ones(motion.nx)
-    scale[motion.split :] = 1.5
-    radius, length = settings.radius, 1.0 if settings.radius > 0.15 else 0.2
-    at = motion.evaluate(x)
-    violation = bounds.violation(at.g)
-    multipliers: Array | None = None
-    extra = np.zeros(at.g.shape, bool)
+    descent = _Descent(motion, bounds, settings, x)
     iteration = 0
-    for iteration in range(1, settings.max_iterations + 1):
-        near = 0.4 if length > 0.2 else 0.2 if length > 0.05 else 0.1
-        held = _choose(at.g, bounds, settings.thin, near, motion.leaps(at, LEAP * length)) | extra
-        chosen = _indices(held)
-        step = _solve(motion, at, bounds, chosen, multipliers, settings, radius * scale, violation)
-        if violation > settings.violation_tolerance and (step is None or step[1] > STUCK):
-            step = _solve(motion, at, bounds, chosen, None, settings, radius * scale, violation, relax=True) or step
-        if step is None:
-            radius *= 0.25
-            if radius < 1e-5:
-                break
-            continue
-        dx, beta, active = step
-        cost, g = motion.value(at.x + dx)
-        new_violation = bounds.violation(g)
-        model = at.gradient @ dx + 0.5 * dx @ at.curvature @ dx + 0.5 * settings.proximal * dx @ dx
-        predicted = -model + settings.penalty * violation * (1 - beta)
-        reduction = at.cost - cost + settings.penalty * (violation - new_violation)
-        size = float(np.abs(dx / scale).max())
-        if np.isfinite(reduction) and reduction > 0.05 * predicted:
-            change, length, multipliers = abs(at.cost - cost), size, active
-            if reduction > 0.7 * predicted and size > 0.8 * radius:
-                radius = min(2.5 * radius, 1.0)
-            elif reduction < 0.3 * predicted:
-                radius *= 0.5
-            done = change < settings.cost_tolerance * cost and new_violation < settings.violation_tolerance
-            if done:
-                return Result(at.x + dx, cost, new_violation, iteration)
-            at = motion.evaluate(at.x + dx)
-            violation = new_violation
-            extra[:] = False
-        else:
-            left_out = (bounds.excess(g) > settings.violation_tolerance) & ~held
-            extra |= left_out
-            if not left_out.any():
-                radius = 0.35 * min(radius, size)
-        if radius < 1e-5:
-            break
-    return Result(at.x, at.cost, violation, iteration)
+    while iteration < settings.max_iterations and not descent.ended:
+        iteration += 1
+        descent.advance()
+    return Result(descent.x, descent.cost, descent.violation, iteration)
 
 
-def _indices(held: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    k, which = np.nonzero(held)
-    return k, which
+class _Descent:
+    """An iterate and what is known for the next step.
 
-
-def _choose(g: Array, bounds: Bounds, thin: int, near: float, leaps: Array) -> NDArray[np.bool_]:
-    """Pick the residuals that matter, shape (K, m).
-
-    They are close to a bound, and at a local maximum, active, or on the thinned grid; or they are sharp and may leap
-    over it.
+    Attributes:
+        x: The variables.
+        cost: Objective there.
+        violation: Worst violation there.
+        ended: Whether there is nothing more to gain.
     """
-    excess = bounds.excess(g)
-    peak = np.zeros(excess.shape, bool, order="F")
-    peak[1:-1] = (excess[1:-1] >= excess[:-2]) & (excess[1:-1] >= excess[2:])
-    peak[0], peak[-1] = excess[0] >= excess[1], excess[-1] >= excess[-2]
-    wide = peak.copy("F")
-    wide[1:] |= peak[:-1]
-    wide[:-1] |= peak[1:]
-    wide[::thin] = True
-    wide |= excess > -0.003
-    picked: NDArray[np.bool_] = (wide & (excess > -near)) | (bounds.sharp & (excess > -leaps))
-    return picked
 
+    def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
+        at = motion.evaluate(x)
+        self._at: Evaluation | None = at
+        self.x, self.cost, self.violation = x, at.cost, bounds.violation(at.g)
+        self.ended = False
+        self._motion, self._bounds, self._settings = motion, bounds, settings
+        self._scale = np.ones(motion.nx)
+        self._scale[motion.split :] = RATE_SHARE
+        self._radius = settings.radius
+        self._length = 1.0 if settings.radius > WIDE else 0.2  # of the last step, in the same norm
+        self._multipliers: Array | None = None
+        self._missed = np.zeros(at.g.shape, bool)  # residuals that a rejected step broke unseen
 
-def _solve(  # noqa: PLR0917
-    motion: Transcription,
-    at: Evaluation,
-    bounds: Bounds,
-    chosen: tuple[NDArray[np.intp], NDArray[np.intp]],
-    multipliers: Array | None,
-    settings: Settings,
-    box: Array,
-    violation: float,
-    *,
-    relax: bool = False,
-) -> tuple[Array, float, Array] | None:
-    """Solve the quadratic model; return the step, the elastic variable and the multipliers, or None."""
-    import daqp
+    def advance(self) -> None:
+        """Try a step: take it, or know better for the next one."""
+        at = self._at = self._at or self._motion.evaluate(self.x)
+        held = self._held(at)
+        settings = self._settings
+        model = Model(self._motion, at, self._bounds, self.violation, settings.proximal, settings.penalty)
+        step = self._propose(model, held)
+        if step is None:
+            self._radius *= 0.25
+        else:
+            self._try(model, step, held)
+        self.ended |= self._radius < SMALLEST
 
-    k, which = chosen
-    nx, m = motion.nx, len(k)
-    g, lower, upper = at.g[k, which], bounds.lower[k, which], bounds.upper[k, which]
-    above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
-    rows = np.empty((m, nx + 1))
-    rows[:, :nx] = motion.rows(at, k, which)
-    rows[:, nx] = below - above
-    high = np.where(below > 0, INFINITE, upper - g)
-    low = np.where(above > 0, -INFINITE, lower - g)
-    if relax:  # what is met may be broken, too, as far as the worst violation is left
-        nearer = upper - g < g - lower
-        rows[:, nx] = np.where(nearer, -violation, violation)
-        high, low = np.where(nearer, upper - g, INFINITE), np.where(nearer, -INFINITE, lower - g)
-    hessian = np.zeros((nx + 1, nx + 1))
-    hessian[:nx, :nx] = at.curvature
-    diagonal = np.arange(nx)
-    hessian[diagonal, diagonal] += settings.proximal
-    hessian[nx, nx] = ELASTIC
-    linear = np.append(at.gradient, settings.penalty * violation + 1e-3)
-    sense = np.zeros(nx + 1 + m, np.int32)
-    if multipliers is not None:
-        before = multipliers[k, which]
-        sense[nx + 1 :][before > 1e-9] = 1
-        sense[nx + 1 :][before < -1e-9] = 3
-    solution, _, flag, info = daqp.solve(
-        hessian,
-        linear,
-        rows,
-        np.concatenate([box, [1.0], np.minimum(high, INFINITE)]),
-        np.concatenate([-box, [0.0], np.maximum(low, -INFINITE)]),
-        sense,
-        primal_tol=1e-6,
-        iter_limit=settings.qp_iterations,
-    )
-    if flag < 1 or not np.isfinite(solution).all():
-        return None
-    active = np.zeros(at.g.shape)
-    active[k, which] = info["lam"][nx + 1 :]
-    return solution[:nx], float(solution[nx]), active
+    def _held(self, at: Evaluation) -> Mask:
+        """Choose the residuals of the next quadratic programme."""
+        near = next(near for length, near in NEAR if self._length > length)
+        leaps = self._motion.leaps(at, LEAP * self._length)
+        return choose(at.g, self._bounds, thin=self._settings.thin, near=near, leaps=leaps) | self._missed
+
+    def _propose(self, model: Model, held: Mask) -> Step | None:
+        """Solve the quadratic programme, again in other ways where that helps little."""
+        box = self._radius * self._scale
+        step = model.solve(held, box, warm=self._multipliers)
+        if self.violation > self._settings.violation_tolerance and (step is None or step.left > STUCK):
+            return model.solve(held, box, relax=True) or step
+        if step is None and self._multipliers is not None:
+            return model.solve(held, box)
+        return step
+
+    def _try(self, model: Model, step: Step, held: Mask) -> None:
+        """Take a step if it holds what it promised."""
+        settings = self._settings
+        x = self.x + step.dx
+        cost, g = self._motion.value(x)
+        violation = self._bounds.violation(g)
+        predicted = -model.cost(step.dx) + settings.penalty * self.violation * (1 - step.left)
+        reduction = self.cost - cost + settings.penalty * (self.violation - violation)
+        size = float(np.abs(step.dx / self._scale).max())
+        if np.isfinite(reduction) and reduction > ENOUGH * predicted:
+            if reduction > GOOD * predicted and size > 0.8 * self._radius:
+                self._radius = min(2.5 * self._radius, LARGEST)
+            elif reduction < POOR * predicted:
+                self._radius *= 0.5
+            feasible = violation < settings.violation_tolerance
+            self.ended = feasible and abs(self.cost - cost) < settings.cost_tolerance * cost
+            self._at, self.x, self.cost, self.violation = None, x, cost, violation
+            self._length, self._multipliers = size, step.multipliers
+            self._missed[:] = False
+        else:
+            missed = (self._bounds.excess(g) > settings.violation_tolerance) & ~held
+            self._missed |= missed
+            if not missed.any():
+                self._radius = 0.35 * min(self._radius, size)

@@ -1,0 +1,146 @@
+"""The quadratic programme of one step: which residuals it holds, and its solution by DAQP."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.refine.transcription import Evaluation, Transcription
+
+if TYPE_CHECKING:
+    from cnpgen.refine.sqp import Bounds
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+INFINITE = 1e30  # what DAQP takes for no bound
+ELASTIC = 1e-2  # curvature of the elastic variable's cost; far smaller ones triple the working-set changes
+USED = 1e-3  # its slope where nothing is violated
+MULTIPLIER = 1e-9  # smaller ones belong to residuals that are not active
+FEASIBLE = 1e-6  # of DAQP
+CHANGES = 3000  # largest number of working-set changes
+ACTIVE = 3e-3  # residuals this close to a bound are held at every grid point
+LOWER, UPPER = 3, 1  # how DAQP is told what is active
+
+
+@dataclass(frozen=True)
+class Step:
+    """Solution of a quadratic programme.
+
+    Attributes:
+        dx: The step, shape (nx,).
+        left: Fraction of the violations that it leaves.
+        multipliers: Of all residuals, shape (K, m); 0 for those that are not held.
+    """
+
+    dx: Array
+    left: float
+    multipliers: Array
+
+
+@dataclass(frozen=True)
+class Model:
+    """Quadratic model of the objective and linear one of the residuals near a point.
+
+    Attributes:
+        motion: The transcription.
+        at: The point.
+        bounds: Bounds of the residuals.
+        violation: Worst violation there.
+        proximal: Weight of the proximal term.
+        penalty: Cost of the worst violation.
+    """
+
+    motion: Transcription
+    at: Evaluation
+    bounds: "Bounds"
+    violation: float
+    proximal: float
+    penalty: float
+
+    def cost(self, dx: Array) -> float:
+        """Return the change of the objective that a step promises."""
+        return float(self.at.gradient @ dx + 0.5 * dx @ self.at.curvature @ dx + 0.5 * self.proximal * dx @ dx)
+
+    def solve(self, held: Mask, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
+        """Return the best step within the box, or None where there is none.
+
+        Args:
+            held: Residuals that the programme holds, shape (K, m).
+            box: Largest change of every variable, shape (nx,).
+            warm: Multipliers, shape (K, m), whose residuals are taken to be active at first; None for none.
+            relax: Whether residuals that are met may be broken, too, as far as the worst violation is left.
+        """
+        import daqp
+
+        k, which = np.nonzero(held)
+        rows, low, high = self._rows(k, which, relax=relax)
+        sense = np.zeros(self.motion.nx + 1 + len(k), np.int32)
+        if warm is not None:
+            before = warm[k, which]
+            sense[self.motion.nx + 1 :] = np.select([before > MULTIPLIER, before < -MULTIPLIER], [UPPER, LOWER], 0)
+        hessian, linear = self._objective()
+        solution, _, flag, info = daqp.solve(
+            hessian,
+            linear,
+            rows,
+            np.concatenate([box, [1.0], np.minimum(high, INFINITE)]),
+            np.concatenate([-box, [0.0], np.maximum(low, -INFINITE)]),
+            sense,
+            primal_tol=FEASIBLE,
+            iter_limit=CHANGES,
+        )
+        if flag < 1 or not np.isfinite(solution).all():
+            return None
+        multipliers = np.zeros(self.at.g.shape)
+        multipliers[k, which] = info["lam"][self.motion.nx + 1 :]
+        return Step(solution[:-1], float(solution[-1]), multipliers)
+
+    def _objective(self) -> tuple[Array, Array]:
+        """Hessian and slope in the variables and the elastic one."""
+        nx = self.motion.nx
+        hessian = np.zeros((nx + 1, nx + 1))
+        hessian[:nx, :nx] = self.at.curvature
+        hessian[range(nx), range(nx)] += self.proximal
+        hessian[nx, nx] = ELASTIC
+        return hessian, np.append(self.at.gradient, self.penalty * self.violation + USED)
+
+    def _rows(self, k: NDArray[np.intp], which: NDArray[np.intp], *, relax: bool) -> tuple[Array, Array, Array]:
+        """Gradients of held residuals, shape (m, nx + 1), and how far they may fall and rise."""
+        g, lower, upper = self.at.g[k, which], self.bounds.lower[k, which], self.bounds.upper[k, which]
+        rows = np.empty((len(k), self.motion.nx + 1))
+        rows[:, :-1] = self.motion.rows(self.at, k, which)
+        if relax:
+            nearer = upper - g < g - lower
+            rows[:, -1] = np.where(nearer, -self.violation, self.violation)
+            return rows, np.where(nearer, -INFINITE, lower - g), np.where(nearer, upper - g, INFINITE)
+        above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
+        rows[:, -1] = below - above
+        return rows, np.where(above > 0, -INFINITE, lower - g), np.where(below > 0, INFINITE, upper - g)
+
+
+def choose(g: Array, bounds: "Bounds", *, thin: int, near: float, leaps: Array) -> Mask:
+    """Pick the residuals that matter, shape (K, m).
+
+    They are close to a bound, and at a local maximum, active, or on the thinned grid; or they are sharp and may leap
+    over it.
+
+    Args:
+        g: Residuals, shape (K, m).
+        bounds: Their bounds.
+        thin: Every how many grid points the thinned grid has one.
+        near: What is close.
+        leaps: How far sharp residuals may leap, shape (K, m).
+    """
+    excess = bounds.excess(g)
+    peak = np.zeros(excess.shape, bool, order="F")
+    peak[1:-1] = (excess[1:-1] >= excess[:-2]) & (excess[1:-1] >= excess[2:])
+    peak[0], peak[-1] = excess[0] >= excess[1], excess[-1] >= excess[-2]
+    wide = peak.copy("F")
+    wide[1:] |= peak[:-1]
+    wide[:-1] |= peak[1:]
+    wide[::thin] = True
+    wide |= excess > -ACTIVE
+    picked: Mask = (wide & (excess > -near)) | (bounds.sharp & (excess > -leaps))
+    return picked
