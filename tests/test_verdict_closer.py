@@ -7,7 +7,7 @@ import pytest
 from example_plans import bent, load
 
 from cnpgen.verdict import Margin
-from cnpgen.verdict.closer import keep_worse
+from cnpgen.verdict.closer import intervals, keep_worse
 
 judge_module = import_module("cnpgen.verdict.judge")  # the package has a function of the same name
 
@@ -29,6 +29,52 @@ def test_where_edges_pass_each_other_between_two_moments_the_peak_is_found(
     assert found.metrics.to_dict() == coarse.metrics.to_dict()
     assert found.paper == coarse.paper
     assert found.samples == coarse.samples
+
+
+@pytest.mark.parametrize(("seed", "step"), [(9, 1e-3), (8, 3e-3)])
+def test_a_peak_far_from_the_deepest_moment_is_found_where_it_decides(seed: int, step: float) -> None:
+    """The object touches twice; where it is a little less deep at the moments, it is deeper between them."""
+    plan = bent(load("dragging"), 0.02, seed=seed)
+    deepest = plan.judged(step=step / 40).margins["object contact"]
+    moments = plan.judged(step=step).margins["object contact"]
+    assert abs(deepest.time - moments.time) > 10 * step
+    strict = plan.with_constraint("ObjectContact", tolerance=moments.excess + 2e-5).judged(step=step)
+    found = strict.margins["object contact"]
+    assert not found.ok
+    assert found.excess == pytest.approx(deepest.excess, abs=2e-5)
+    assert found.time == pytest.approx(deepest.time, abs=step)
+
+
+def moving(distances: list[float], ways: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Distances from one obstacle, and the corners of an object that moves by so much from moment to moment."""
+    corners = np.zeros((8, 3, len(distances)))
+    corners[:, 0] = np.concatenate([[0.0], np.cumsum(ways)])
+    return np.array([distances]), corners
+
+
+def test_intervals_beside_the_deepest_moment_and_those_that_could_hide_too_much_are_chosen() -> None:
+    distances = [5.0, 1.0, 3.0, 3.0, 2.0, 2.0, 9.0, 9.0]
+    assert intervals(*moving(distances, [1.0] * 7), 0.0).tolist() == [0, 1]
+    assert intervals(*moving(distances, [1.0, 1.0, 1.0, 1.0, 4.1, 1.0, 18.1]), 0.0).tolist() == [0, 1, 4, 6]
+    assert intervals(*moving(distances, [1.0, 1.0, 1.0, 1.0, 3.9, 1.0, 17.9]), 0.0).tolist() == [0, 1]
+
+
+def test_where_the_deepest_moment_is_too_deep_already_nothing_else_is_looked_into() -> None:
+    assert intervals(*moving([5.0, -1.0, 3.0, 3.0, 2.0], [50.0] * 4), -0.5).tolist() == [0, 1]
+
+
+def test_at_either_end_there_is_one_interval_and_nan_is_no_trouble() -> None:
+    assert intervals(*moving([1.0, 2.0, 3.0], [0.0] * 2), 0.0).tolist() == [0]
+    assert intervals(*moving([3.0, 2.0, 1.0], [0.0] * 2), 0.0).tolist() == [1]
+    assert intervals(*moving([3.0, np.nan, 1.0], [9.0] * 2), 0.0).tolist() == [0, 1]
+
+
+def test_of_more_intervals_than_can_be_looked_into_those_that_hide_most_are_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("cnpgen.verdict.closer.MOST", 2)
+    distances, corners = moving([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [9.0, 9.0, 20.0, 9.1, 30.0])
+    assert intervals(distances, corners, 0.0).tolist() == [0, 2, 4]
 
 
 def test_a_peak_at_either_end_is_no_trouble() -> None:

@@ -36,7 +36,7 @@ class BrakingReach(Stage):
     """Full braking keeps the tip over the table, at the start and, reversed in time, at the goal."""
 
     needs = ("start_q", "start_dq", "goal_q", "goal_dq")
-    margin: float = field("how far before the edge full braking must end", unit="m", default=1e-3)
+    margin: float = field("how far before the edge full braking must end", unit="m", default=1e-3, low=0.0)
 
     def describe(self) -> str:
         """Say what is kept."""

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from cnpgen.recipes import Problem
 from cnpgen.robots.symbolic import SymbolicState, symbols
-from cnpgen.verdict.judge import JERK_RATE
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -78,7 +77,7 @@ def criterion_residuals(robot: "Robot", kind: Kind) -> Any:
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
     if kind == "jerk":
         jerk = [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in zip(p1, p2, p3, strict=True)]
-        e = [x / float(JERK_RATE * limit) for x, limit in zip(jerk, robot.acceleration_limit, strict=True)]
+        e = [x / float(limit) for x, limit in zip(jerk, robot.jerk_limit, strict=True)]
     else:
         state = SymbolicState(robot, p, dq, ddq, [], (), None)
         e = _across(state) if kind == "centrifugal" else _shares(state)

@@ -118,8 +118,10 @@ def upright_box_separation(centre: Vec, rotation: list[Vec], size: tuple[float, 
     """Separation of a cuboid from an axis-aligned box along the best face normal [m]; negative inside.
 
     Exact for a cuboid whose z axis is vertical and that overlaps the box (its faces' normals and the box's are then all
-    the separating axes that there are). A lower bound of the distance where they are apart and, up to terms of the
-    order of the depth of penetration times tilt^2, where the cuboid is tilted.
+    the separating axes that there are), and a lower bound of the distance where they are apart. Where the cuboid is
+    tilted it is a lower bound, too, up to terms of the order of depth x tilt^2: axes that lean like the cuboid, and
+    those between edges, are not tried, so that contacts look deeper by up to tilt [rad] x its longest edge (2.8 mm at
+    0.01 rad for 0.3 m).
 
     Args:
         centre: Centre of the cuboid [m].

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -55,6 +57,11 @@ class Robot:
     def n(self) -> int:
         """Number of planned joints."""
         return len(self.joint_names)
+
+    @property
+    def jerk_limit(self) -> Array:
+        """What jerks are compared with [rad/s^3], shape (n,); the authors' figure: reported, not constrained."""
+        return JERK_RATE * self.acceleration_limit
 
     @cached_property
     def skeleton(self) -> tuple[tuple[int, int], ...]:

@@ -28,7 +28,6 @@ from cnpgen.verify.path import PathWorld
 Array = NDArray[np.float64]
 
 _GLANCE = np.linspace(0, 1, 33)  # phases at which most plans that are not valid show it
-JERK_RATE = 5.0  # 1/s: the authors' jerk limit, reported and not constrained, is 5 x the acceleration limit
 
 
 def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
@@ -221,7 +220,7 @@ def _metrics(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) 
     return Metrics(
         duration=float(samples.t[-1]),
         effort=samples.integral(np.sum(share**2, axis=0)),
-        jerk=float(np.max(np.abs(jerk) / (JERK_RATE * robot.acceleration_limit[:, None]))),
+        jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
         hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
         z_error=np.nan if table is None else samples.integral(np.abs(world.tip_position[2] - table.z)),
         vertical_error=samples.integral(_tilt(world.tip_rotation)) if upright else np.nan,
