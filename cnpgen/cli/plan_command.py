@@ -73,7 +73,7 @@ def _check(arguments: argparse.Namespace) -> None:
     from cnpgen.errors import UsageError
 
     default = arguments.parser.get_default
-    lost = [name for name in ("workers", *REFINING) if getattr(arguments, name) != default(name)]
+    lost = [name for name in ("workers", "explain", *REFINING) if getattr(arguments, name) != default(name)]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} is for --refine, which is missing")
     check_place(arguments.out, force=arguments.force)

@@ -36,9 +36,6 @@ def add_options(parser: Parser) -> None:
         "--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
-    parser.add_argument(
-        "--explain", action="store_true", help="say of every plan that is not valid what is proven about its problem"
-    )
     add_json(parser)
 
 
@@ -61,6 +58,7 @@ def add_refining(parser: argparse._ActionsContainer) -> None:
         help="relative change of the objective at which a plan is finished (default: 2e-4)",
     )
     option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms)")
+    option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")
 
 
 def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *, title: str) -> int:
