@@ -72,6 +72,14 @@ def test_garbage_among_plans_leaves_the_others_alone(problems: Plans, solved: Pl
     assert same(found.plans.select(others), solved.select(others))
 
 
+def test_plans_that_take_days_are_made_as_if_there_were_none(problems: Plans, solved: Plans) -> None:
+    some = slice(0, 3)
+    few = solved.select(some)
+    days = refine_plans(replace(few, rate_control_points=1e-6 * few.rate_control_points), workers=1)
+    assert days.given.duration.min() > 86_400
+    assert same(days.plans, few)
+
+
 def test_an_interrupted_run_goes_on_where_it_was(problems: Plans, solved: Plans, tmp_path: Path) -> None:
     def stop(_plans: int, _valid: int) -> None:
         raise KeyboardInterrupt

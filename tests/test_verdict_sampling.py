@@ -5,7 +5,7 @@ import pytest
 from example_plans import load
 
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.sampling import AT_ENDS, FEWEST, MOST, sample, table_phases, time_table
+from cnpgen.verdict.sampling import AT_ENDS, FEWEST, LONGEST, sample, table_phases, time_table
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
@@ -37,11 +37,12 @@ def test_times_are_right_where_the_rate_begins_at_almost_nothing():
 
 
 def test_a_motion_that_would_take_too_many_samples_is_not_sampled():
-    rate = np.full(20, 1.0 / (1e-3 * MOST))
-    assert sample(time_table(rate, 7), 1e-3, 13) is None
-    some = sample(time_table(2 * rate, 7), 1e-3, 13)
+    rate = np.full(20, 1.0 / (1e-3 * LONGEST))
+    assert sample(time_table(0.99 * rate, 7), 1e-3, 13) is None
+    some = sample(time_table(1.01 * rate, 7), 1e-3, 13)
     assert some is not None
-    assert MOST / 2 < len(some.s) < MOST
+    assert LONGEST < len(some.s) < 1.1 * LONGEST
+    assert sample(time_table(0.99 * rate, 7), 2e-3, 13) is not None
 
 
 def test_a_coarser_step_takes_fewer_samples():

@@ -9,7 +9,7 @@ from cnpgen.wording import counted
 
 if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation
-    from cnpgen.verdict import Margin, Verdict
+    from cnpgen.verdict import Verdict
 
 METRICS = {  # metric -> what it is called, in a summary and in a list, and its format
     "duration_s": ("motion time [s]", "T [s]", "{:.4f}"),
@@ -49,13 +49,25 @@ def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ..
         plans = [(index, verdict) for index, verdict in enumerate(found.verdicts) if str(verdict.reason) == reason]
         index, worst = max(plans, key=lambda plan: _severity(plan[1]))
         if not worst.valid:
-            rows.append((reason, f"{number:,}", f"plan {index}{f': {worst.worst}' if worst.worst else ''}"))
+            why = _why(worst, found.step)
+            rows.append((reason, f"{number:,}", f"plan {index}{why and f': {why}'}"))
     return rows
 
 
 def _figure(form: str, value: float) -> str:
     """Write a number in its column's form, and one that would not fit into any column in three digits."""
     return form.format(value) if abs(value) < LONG else f"{value:.3g}"
+
+
+def _why(verdict: "Verdict", step: float) -> str:
+    """Say what decided, as far as there is more to say than the reason."""
+    from cnpgen.verdict.sampling import LONGEST
+    from cnpgen.verdict.verdict import Reason
+
+    if verdict.reason == Reason.TOO_LONG:
+        time = f"{verdict.metrics.duration:.3g} s"
+        return f"{time} are more than {LONGEST:,} steps of {1e3 * step:g} ms; with a longer --step it is looked at"
+    return str(verdict.worst or "")
 
 
 def _severity(verdict: "Verdict") -> float:
@@ -100,12 +112,9 @@ def listing_text(found: "Evaluation") -> str:
         values = [(METRICS[name][2], metrics[index].get(name)) for name in shown]
         figures = ["-" if value is None else _figure(form, value) for form, value in values]
         verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
-        rows.append((str(index), str(sample), str(verdict.reason), *figures, _worst(verdict.worst)))
+        why = _why(verdict, found.step) or "-"
+        rows.append((str(index), str(sample), str(verdict.reason), *figures, why))
     return "\n".join(_columns(rows, left={2, len(rows[0]) - 1}))
-
-
-def _worst(margin: "Margin | None") -> str:
-    return str(margin) if margin else "-"
 
 
 def _columns(rows: list[tuple[str, ...]], left: set[int]) -> list[str]:

@@ -20,12 +20,14 @@ from cnpgen.refine.sqp import DEFAULT, Result, Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Attempt, Outcome, Task
 from cnpgen.refine.transcription import Stage, Transcription
+from cnpgen.trajectory.motion import Motion
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
     from cnpgen.verify.world import World
 
 Array = NDArray[np.float64]
+SLOWEST = 60.0  # s: a plan that takes longer is no start
 LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 
@@ -118,11 +120,15 @@ class Refiner:
     def given(self, task: Task) -> Attempt | None:
         """Return the plan of the task with exact boundary control points, or None where there is no usable one.
 
+        One that takes longer than a minute is none: from there the quadratic programmes hardly move.
+
         Rate control points that are not positive, though r may be, are raised: the variables are logarithms.
         """
         if task.path is None or task.rate is None or not np.isfinite(task.path).all():
             return None
         if not np.isfinite(task.rate).all() or not np.any(task.rate > 0):
+            return None
+        if not Motion(task.path[None], task.rate[None], self.spec.degree).duration()[0] < SLOWEST:
             return None
         x = self.check.transcription(task).pack(task.path, np.maximum(task.rate, LOWEST_RATE * task.rate.max()))
         cost, excess = self.check.measure(task, x)

@@ -10,7 +10,8 @@ from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
 
-FEWEST, MOST = 200, 200_000  # samples of a motion
+FEWEST = 200  # samples of a motion
+LONGEST = 60_000  # time steps that a motion may take: a minute at 1 ms, which takes a second to look at
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
 CELLS = 4096  # of equal size in the table of times
 PER_SPAN = 4  # samples between two knots, evenly in phase
@@ -71,10 +72,10 @@ def sample(table: Array, step: float, spans: int) -> Samples | None:
         spans: Number of intervals between the knots of the finer spline.
 
     Returns:
-        The samples, or None if the motion is too long for ``MOST`` of them.
+        The samples, or None if the motion takes longer than ``LONGEST`` steps.
     """
     duration = table[-1]
-    if not duration < step * MOST / SPARE:
+    if not duration < step * LONGEST:
         return None
     count = max(FEWEST, int(np.ceil(SPARE * duration / step)) + 1)
     phases = table_phases()
