@@ -5,6 +5,7 @@ import io
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.refine.task import Outcome, Refined
+from cnpgen.store.files import machine_error
 from cnpgen.wording import counted
 
 MAGIC = b"cnpgen journal 1\n"
@@ -45,7 +47,8 @@ class Journal:
 
     def close(self) -> None:
         """Close the file; others may open it again."""
-        self._file.close()
+        with suppress(OSError):  # of what could not be written before, either; it does not count
+            self._file.close()
 
     def _write(self, payload: bytes) -> None:
         try:
@@ -53,7 +56,7 @@ class Journal:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise MachineError(f"{self.path}: {error.strerror or error}; what is in it already counts") from error
+            raise machine_error("write", self.path, error) from error
 
 
 def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal:
