@@ -81,10 +81,13 @@ class FineCheck:
         speed, strength = (size[self._needs == needs].max(initial=1.0) for needs in (1, 2))
         return cost, Excess(worst, bool(high[:, self._needs == 0].any()), max(speed, float(np.sqrt(strength))))
 
-    def slow_down(self, task: Task, motion: Transcription, x: Array) -> tuple[Array, float, Excess]:
+    def slow_down(
+        self, task: Task, motion: Transcription, x: Array, *, at_any_cost: bool = False
+    ) -> tuple[Array, float, Excess]:
         """Slow a motion from rest to rest down uniformly until velocities, accelerations and torques are met.
 
-        Its path stays, its rate is divided by one factor. That cures no position and no torque against gravity.
+        Its path stays, its rate is divided by one factor. That cures no position and no torque against gravity: where
+        these are broken, too, nothing is done, unless it is asked for at any cost.
 
         Returns:
             ``(variables, objective, excess)`` of the slowed motion, or of the last one tried.
@@ -92,7 +95,9 @@ class FineCheck:
         total = 1.0
         cost, excess = self.measure(task, x)
         for _ in range(ATTEMPTS):
-            if excess.worst <= 1 or excess.position or total * excess.slower > LARGEST:
+            if excess.worst <= 1 or excess.slower <= 1 or not np.isfinite(excess.slower):
+                break
+            if not at_any_cost and (excess.position or total * excess.slower > LARGEST):
                 break
             total *= excess.slower * (1 + 1e-9)
             x = x.copy()

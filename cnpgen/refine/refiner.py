@@ -160,6 +160,9 @@ class Refiner:
         for start in self._other_starts(task):
             other = self._attempt(task, self.passes.other, _variables(start), Outcome.RESTARTED)
             yield self._slowed(task, other) if other.excess > 1 and task.at_rest else other
+            best = other if other.is_better(best) else best
+        if task.at_rest:  # what is left to be said of it is why no speed is slow enough
+            yield self._slowed(task, best, at_any_cost=True)
 
     def minimise(self, task: Task, which: Pass, x: Array, *, warm: bool = False) -> Result:
         """Run one pass from x."""
@@ -183,8 +186,9 @@ class Refiner:
         cost, excess = self.check.measure(task, result.x)
         return Attempt(result.x, excess.worst, cost, outcome, result.iterations)
 
-    def _slowed(self, task: Task, attempt: Attempt) -> Attempt:
-        x, cost, excess = self.check.slow_down(task, self.check.transcription(task), attempt.x)
+    def _slowed(self, task: Task, attempt: Attempt, *, at_any_cost: bool = False) -> Attempt:
+        motion = self.check.transcription(task)
+        x, cost, excess = self.check.slow_down(task, motion, attempt.x, at_any_cost=at_any_cost)
         slowed = Attempt(x, excess.worst, cost, Outcome.SLOWED, attempt.iterations)
         return slowed if slowed.is_better(attempt) else attempt
 

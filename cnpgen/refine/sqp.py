@@ -21,6 +21,7 @@ WIDE = 0.15  # trust radius of a start that is not near a solution
 LEAP = 1.5  # the next step may be longer than the last one by this factor
 NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the first, residuals this near are held
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
+PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
@@ -123,6 +124,7 @@ class _Descent:
         self._at: Evaluation | None = at
         self.x, self.cost, self.violation = x, at.cost, bounds.violation(at.g)
         self.ended = False
+        self._violations = [self.violation]
         self._motion, self._bounds, self._settings = motion, bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
@@ -142,7 +144,14 @@ class _Descent:
             self._radius *= 0.25
         else:
             self._try(model, step, held)
-        self.ended |= self._radius < SMALLEST
+        self._violations.append(self.violation)
+        self.ended |= self._radius < SMALLEST or self._is_stuck()
+
+    def _is_stuck(self) -> bool:
+        """Whether the violation hardly falls any more."""
+        if self.violation < self._settings.violation_tolerance or len(self._violations) <= PATIENCE:
+            return False
+        return self.violation > PROGRESS * self._violations[-1 - PATIENCE]
 
     def _held(self, at: Evaluation) -> Mask:
         """Choose the residuals of the next quadratic programme."""
