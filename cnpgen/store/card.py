@@ -41,7 +41,8 @@ def load(split):
 rows = load("SPLIT")
 ```
 
-`file[name].attrs` has the units, the names of the columns and their limits. With Hugging Face datasets:
+`file[name].attrs` has the units, the names of the columns and their limits. With Hugging Face
+datasets (`pip install datasets h5py`):
 
 ```text
 datasets.load_dataset("./FOLDER")
