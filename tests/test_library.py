@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from example_stages import Roll
 
 from cnpgen import library, plugins
 from cnpgen.constraints.constraint import Constraint
@@ -17,24 +18,9 @@ from cnpgen.library import (
     load_problem,
     recipes_root,
 )
-from cnpgen.pipelines.stage import Stage
 from cnpgen.plugins import CONSTRAINTS, STAGES
 from cnpgen.recipes import recipe_digest, resolved
 from cnpgen.schema import Range, field
-
-
-@dataclass(frozen=True, kw_only=True)
-class Roll(Stage):
-    size: Range = field("size of the die", unit="m")
-
-    def describe(self):
-        return "roll"
-
-    def provides(self, context):
-        return ()
-
-    def prepare(self, context):
-        return lambda batch, random: None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from example_stages import Roll
 
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.library import list_recipes, load_dataset_recipe, load_problem
-from cnpgen.pipelines.stage import Stage
 from cnpgen.recipes import (
     DatasetRecipe,
     LimitSpec,
@@ -22,21 +22,7 @@ from cnpgen.recipes import (
     resolved,
     split_rows,
 )
-from cnpgen.schema import Range, field
-
-
-@dataclass(frozen=True, kw_only=True)
-class Roll(Stage):
-    size: Range = field("size of the die", unit="m")
-
-    def describe(self):
-        return "roll"
-
-    def provides(self, context):
-        return ()
-
-    def prepare(self, context):
-        return lambda batch, random: None
+from cnpgen.schema import Range
 
 
 @pytest.fixture

@@ -1,0 +1,20 @@
+"""A stage that does nothing, for tests of recipes."""
+
+from dataclasses import dataclass
+
+from cnpgen.pipelines.stage import Stage
+from cnpgen.schema import Range, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roll(Stage):
+    size: Range = field("size of the die", unit="m")
+
+    def describe(self):
+        return "roll"
+
+    def provides(self, context):
+        return ()
+
+    def prepare(self, context):
+        return lambda batch, random: None
