@@ -184,10 +184,16 @@ def test_a_truncated_model_an_unknown_one_and_a_file_that_is_none_are_one_line_e
     cut = Path(shutil.copy(trained, tmp_path / "cut.h5"))
     cut.write_bytes(cut.read_bytes()[:2000])
     folder, rest = str(tiny("airhockey-hit")), ["-o", str(tmp_path / "p.h5")]
-    for model, code, word in ((str(cut), 1, "cut off"), ("airhockey-hot", 2, "unknown model"), ("x.h5", 1, "missing")):
+    for model, code, word in ((str(cut), 1, "cut off"), ("airhockey-hot", 2, "unknown model"), ("x.h5", 2, "not there")):
         found, text = failing(capsys, ["plan", folder, "--model", model, *rest])
         assert (found, text.count("\n")) == (code, 1)
         assert word in text
+
+
+def test_problems_that_are_not_there_are_a_wrong_argument(trained, tmp_path, capsys):
+    words = ["plan", str(tmp_path / "nowhere"), "--model", str(trained), "-o", str(tmp_path / "p.h5")]
+    expected = "nowhere is not there, expected a dataset or an HDF5 file of boundary conditions"
+    assert failing(capsys, words) == (2, f"cnpgen: error: {tmp_path}/{expected}\n")
 
 
 def test_options_of_rows_are_not_taken_for_a_file(trained, tmp_path, capsys):
