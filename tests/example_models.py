@@ -10,6 +10,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.kit import Surroundings, make_kit
+from cnpgen.planner.landing import make_landing
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.plans.problem import record_problem
 from cnpgen.robots.robot import load_robot
@@ -68,17 +69,12 @@ def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: 
 def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
     """What one step of training needs, in float32 or float64."""
     given = surroundings_of(name)
-    kit = make_kit(
-        given,
-        bending_steps=settings.bending_steps,
-        landing_steps=settings.landing_steps,
-        slow_down=False,
-        gradients=True,
-    )
+    kit = make_kit(given, bending_steps=settings.bending_steps, landing_steps=settings.landing_steps, slow_down=False)
+    landing = make_landing(given.problem, given.kernels, steps=settings.landing_steps)
     rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
     loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
     architecture = architecture_of(given, rows, settings)
-    return Learner(architecture, given.problem.trajectory, loss, settings, kit.landing), rows
+    return Learner(architecture, given.problem.trajectory, loss, settings, landing), rows
 
 
 def model_path(folder: Path) -> Path:

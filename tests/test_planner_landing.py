@@ -6,8 +6,10 @@ from conftest import columns_of
 from example_models import boundary_of_columns, surroundings_of
 from test_planner_parts import heights, worst_tilt
 
+from cnpgen.network.omega import control_points
 from cnpgen.planner.kit import make_kit
 from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.lanes import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import anchor_line, assemble
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
@@ -15,7 +17,7 @@ DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
 
 def landing_of(name: str) -> Landing:
     given = surroundings_of(name)
-    return make_landing(given.problem, given.kernels, steps=1, gradients=True)
+    return make_landing(given.problem, given.kernels, steps=1)
 
 
 def nearby(tiny, name: str, count: int = 8) -> tuple[np.ndarray, np.ndarray]:
@@ -77,3 +79,28 @@ def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):
     others = [0, 1, *range(3, 8)]
     np.testing.assert_array_equal(found[others], expected[others])
     assert np.isnan(found[2]).any()
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name):
+    given = surroundings_of(name)
+    boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), 8)
+    kit = make_kit(given, bending_steps=1, landing_steps=1, slow_down=False)
+    tasks, random = kit.prepare(boundary), np.random.default_rng(2)
+    phi, log_rate = random.uniform(-1, 1, (8, 10 * given.robot.n)), random.normal(0, 0.3, (8, 20))
+    points = control_points(tasks, phi, log_rate, scale=0.1, spec=given.problem.trajectory)
+    tops = kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+    expected = landing_of(name).land(points.path, tops)
+    offsets = 0.1 * phi + tasks.correction.reshape(8, -1)
+    (found,) = kit.path(ends_of(boundary), lanes(offsets), lanes(points.rate), lanes(tops))
+    np.testing.assert_allclose(rows(found, given.robot.n), expected, atol=1e-10)
+
+
+def test_the_bent_line_is_the_papers_line_bent(tiny):
+    given = surroundings_of("heavy-object")
+    boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 5)
+    tasks = make_kit(given, bending_steps=1, landing_steps=0, slow_down=False).prepare(boundary)
+    rate, spec = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1), given.problem.trajectory
+    line = anchor_line(boundary, rate, spec)
+    bent = landing_of("heavy-object").land(assemble(boundary, line, rate, spec), np.zeros((5, 2)))
+    np.testing.assert_allclose(tasks.correction, bent[:, 3:13] - line, atol=1e-12)

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,7 @@ def add(commands: "Commands[Parser]") -> None:
         choices=("ramped", "fixed", "learned", "bounded"),
         help="weights of the constraints (default: ramped)",
     )
+    option("--growth", metavar="X", type=float, help="by which factor ramped weights grow in the run (default: 30)")
     option(
         "--imitate",
         metavar="X",
@@ -102,8 +104,8 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
 
     names = ("hidden", "layers", "batch_size", "learning_rate", "seed")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
-    if arguments.metric is not None:
-        given["metric"] = METRICS[arguments.metric]
+    metric = METRICS[arguments.metric or "ramped"]
+    given["metric"] = metric if arguments.growth is None else replace(metric, growth=arguments.growth)
     if arguments.imitate is not None:
         given["imitation"] = arguments.imitate
     return TrainingSettings(**given)
@@ -112,7 +114,7 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
     lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
-    names = (*lengths, *network, "metric", "imitate", "seed", "check")
+    names = (*lengths, *network, "metric", "growth", "imitate", "seed", "check")
     default = arguments.parser.get_default
     said = [(name.replace("_", "-"), getattr(arguments, name)) for name in names]
     said = [(name, value) for name, value in said if value != default(name)]

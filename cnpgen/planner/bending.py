@@ -13,69 +13,45 @@ from numpy.typing import NDArray
 
 from cnpgen.planner.expressions import equality_residuals
 from cnpgen.recipes import Problem
-from cnpgen.robots.linalg import dot, solve
-from cnpgen.robots.symbolic import symbols
+from cnpgen.robots.linalg import add, dot, solve
+from cnpgen.robots.symbolic import Vec
 from cnpgen.trajectory.spline import basis, clamped_knots
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-Shape = tuple[int, int, int]  # degree, number of control points, and how many of them the goal fixes
 
 STRAIGHT = 0.05  # weight of the change itself beside that of its second differences
 DAMPING = 1e-6  # keeps steps small where the equalities hardly depend on the joints
 LONGEST = 0.6  # rad: no step moves a control point further
 
 
-def bending(robot: "Robot", problem: Problem, *, shape: Shape, steps: int) -> Any:
-    """Build ``(path, tops) -> change``: all path control points in, change of the interior ones out, point by point.
+def bend(
+    robot: "Robot", problem: Problem, control: list[Vec], tops: Vec, *, steps: int, fixed_at_goal: int
+) -> list[Vec]:
+    """Return how far a path's interior control points must move.
 
     Args:
         robot: The robot.
         problem: The problem.
-        shape: Degree, number of control points, and how many of them the goal fixes.
+        control: All control points of the path, SX scalars [rad].
+        tops: Heights of the obstacles' upper faces [m].
         steps: Number of Gauss-Newton steps.
+        fixed_at_goal: Number of control points that the goal fixes.
     """
-    import casadi as ca
-
-    path, tops, change = _bent(robot, problem, shape, steps)
-    return ca.Function("bending", [path, tops], [ca.cse(change)])
-
-
-def bending_adjoint(robot: "Robot", problem: Problem, *, shape: Shape, steps: int) -> Any:
-    """Build ``(path, tops, seed) -> gradient`` of ``seed . change`` with respect to the path, by the reverse mode."""
-    import casadi as ca
-
-    path, tops, change = _bent(robot, problem, shape, steps)
-    seed = ca.SX.sym("seed", change.numel())
-    gradient = ca.densify(ca.jtimes(change, path, seed, True))
-    return ca.Function("bending_adjoint", [path, tops, seed], [ca.cse(gradient)])
-
-
-def _bent(robot: "Robot", problem: Problem, shape: Shape, steps: int) -> tuple[Any, Any, Any]:
-    """Return the symbols of path and tops, and the change of the interior control points."""
-    import casadi as ca
-
-    degree, points, fixed_at_goal = shape
-    (path_sx, path), (tops, _) = symbols("path", points * robot.n), symbols("tops", len(problem.obstacle))
-    control = [path[i : i + robot.n] for i in range(0, len(path), robot.n)]
-    interior = slice(3, points - fixed_at_goal)
-    table, response = _collocation(degree, points, interior)
+    control, interior = list(control), slice(3, len(control) - fixed_at_goal)
+    table, response = _collocation(problem.trajectory.degree, len(control), interior)
     equality, total = equality_residuals(robot, problem), [[0.0] * robot.n for _ in response]
     for _ in range(steps):
         q = [_combined(row, control) for row in table]
         step = _gauss_newton(equality, q, tops, table[:, interior], response)
-        control[interior] = [_added(*pair) for pair in zip(control[interior], step, strict=True)]
-        total = [_added(*pair) for pair in zip(total, step, strict=True)]
-    return path_sx, tops, ca.vertcat(*[value for point in total for value in point])
+        control[interior] = [add(*pair) for pair in zip(control[interior], step, strict=True)]
+        total = [add(*pair) for pair in zip(total, step, strict=True)]
+    return total
 
 
-def _added(one: list[Any], other: list[Any]) -> list[Any]:
-    return [x + y for x, y in zip(one, other, strict=True)]
-
-
-def _gauss_newton(equality: Any, q: list[list[Any]], tops: Any, inner: Array, response: Array) -> list[list[Any]]:
+def _gauss_newton(equality: Any, q: list[Vec], tops: Vec, inner: Array, response: Array) -> list[Vec]:
     """One step: change of the interior control points that cancels the residuals at the phases to first order.
 
     Args:
@@ -89,7 +65,7 @@ def _gauss_newton(equality: Any, q: list[list[Any]], tops: Any, inner: Array, re
 
     residuals, rows, phases = [], [], []
     for phase, position in enumerate(q):
-        residual, jacobian = equality(ca.vertcat(*position), tops)
+        residual, jacobian = equality(ca.vertcat(*position), ca.vertcat(*tops))
         columns = ca.reshape(jacobian, residual.numel(), len(position))
         for equation in range(residual.numel()):
             residuals.append(residual[equation])
@@ -102,13 +78,13 @@ def _gauss_newton(equality: Any, q: list[list[Any]], tops: Any, inner: Array, re
     for i, entries in enumerate(lower):
         entries[i] += DAMPING
     force = solve(lower, residuals)
-    pulled: list[list[Any]] = [[0.0] * len(q[0]) for _ in q]
+    pulled: list[Vec] = [[0.0] * len(q[0]) for _ in q]
     for strength, row, phase in zip(force, rows, phases, strict=True):
         pulled[phase] = [total + strength * slope for total, slope in zip(pulled[phase], row, strict=True)]
     return [[ca.fmin(ca.fmax(-x, -LONGEST), LONGEST) for x in _combined(row, pulled)] for row in response]
 
 
-def _combined(factors: Array, points: list[list[Any]]) -> list[Any]:
+def _combined(factors: Array, points: list[Vec]) -> Vec:
     """Return the sum of points times factors; what is zero costs nothing."""
     used = [(float(factor), point) for factor, point in zip(factors, points, strict=True) if factor]
     return [sum(factor * point[joint] for factor, point in used) for joint in range(len(points[0]))]

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.planner.curves import landed_path
 from cnpgen.planner.expressions import count_equalities
-from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.lanes import ends_of, lanes, rows
 from cnpgen.planner.model import Model
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.slowing import Slowing, make_slowing
@@ -69,12 +71,12 @@ class Kit:
 
     Attributes:
         prepare: What prepares tasks.
-        landing: What bends the network's plans onto the manifold's equalities; None where nothing does.
+        path: Kernel of ``curves.landed_path``.
         slowing: What slows motions from rest to rest down; None where it must not.
     """
 
     prepare: Preparation
-    landing: Landing | None
+    path: Kernel
     slowing: Slowing | None
 
     def plan(
@@ -94,9 +96,9 @@ class Kit:
             columns: What else is known of the tasks, as ``Plans.columns``.
         """
         tasks = self.prepare(boundary)
-        points, tops = model.control_points(tasks), self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
-        path = points.path if self.landing is None else self.landing.land(points.path, tops)
-        motion = Motion(path, points.rate, model.problem.trajectory.degree)
+        given, tops = model.outputs(tasks), self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+        (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
+        motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
         if self.slowing is not None:
             motion = motion.slower(self.slowing.factor(motion, tops))
         return Plans(
@@ -111,9 +113,7 @@ class Kit:
         )
 
 
-def make_kit(
-    given: Surroundings, *, bending_steps: int, landing_steps: int, slow_down: bool, gradients: bool = False
-) -> Kit:
+def make_kit(given: Surroundings, *, bending_steps: int, landing_steps: int, slow_down: bool) -> Kit:
     """Make the kit of a problem; without equalities there is nothing to bend onto.
 
     Args:
@@ -121,11 +121,9 @@ def make_kit(
         bending_steps: Gauss-Newton steps of the baseline.
         landing_steps: Gauss-Newton steps behind the network.
         slow_down: Whether motions are slowed down; only for those from rest to rest.
-        gradients: Whether gradients go back through the landing.
     """
     problem, robot, kernels = given.problem, given.robot, given.kernels
     bent = count_equalities(robot, problem) > 0
     prepare = prepare_tasks(problem, robot, kernels, bending_steps=bending_steps if bent else 0)
-    lands = bent and landing_steps > 0
-    landing = make_landing(problem, kernels, steps=landing_steps, gradients=gradients) if lands else None
-    return Kit(prepare, landing, make_slowing(problem, robot, kernels) if slow_down else None)
+    path = kernels.load(landed_path, steps=landing_steps if bent else 0)
+    return Kit(prepare, path, make_slowing(problem, robot, kernels) if slow_down else None)

@@ -4,16 +4,15 @@ With it the network need not hold equalities against everything else that it is 
 eleven phases to second order, and between them as well as the spline can be.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.bending import bending, bending_adjoint
+from cnpgen.planner.curves import FIXED_AT_GOAL, path_bend, path_bend_adjoint
+from cnpgen.planner.lanes import lanes
 from cnpgen.recipes import Problem
 
 Array = NDArray[Any]
@@ -21,16 +20,16 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Landing:
-    """Bends plans of one problem onto its equalities; made by ``make_landing``.
+    """Bends plans of one problem onto its equalities while training; made by ``make_landing``.
 
     Attributes:
-        bend: Kernel of ``bending``.
-        adjoint: Kernel of ``bending_adjoint``; None where no gradient is asked for.
+        bend: Kernel of ``curves.path_bend``.
+        adjoint: Kernel of ``curves.path_bend_adjoint``.
         interior: Which path control points move.
     """
 
     bend: Kernel
-    adjoint: Kernel | None
+    adjoint: Kernel
     interior: slice
 
     def land(self, path: Array, tops: Array) -> Array:
@@ -43,7 +42,7 @@ class Landing:
         Returns:
             New control points, of the same shape and type.
         """
-        (change,) = self.bend(_lanes(path), _lanes(tops))
+        (change,) = self.bend(lanes(path), lanes(tops))
         landed = path.copy()
         inner = landed[:, self.interior]
         inner += change.T.reshape(inner.shape)
@@ -57,31 +56,18 @@ class Landing:
             tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
             gradient: Gradient with respect to what ``land`` gave, shape (N, C, n).
         """
-        assert self.adjoint is not None
-        (back,) = self.adjoint(_lanes(path), _lanes(tops), _lanes(gradient[:, self.interior]))
+        (back,) = self.adjoint(lanes(path), lanes(tops), lanes(gradient[:, self.interior]))
         found: Array = gradient + back.T.reshape(path.shape).astype(gradient.dtype, copy=False)
         return found
 
 
-def make_landing(
-    problem: Problem, kernels: KernelLibrary, *, steps: int, gradients: bool, fixed_at_goal: int = 2
-) -> Landing:
+def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int) -> Landing:
     """Load the landing of a problem that has equalities.
 
     Args:
         problem: The problem.
         kernels: Where kernels are loaded from.
         steps: Number of Gauss-Newton steps, at least 1.
-        gradients: Whether gradients are asked for.
-        fixed_at_goal: Control points that the goal fixes.
     """
-    spec = problem.trajectory
-    shape = (spec.degree, spec.path_control_points, fixed_at_goal)
-    adjoint = kernels.load(bending_adjoint, shape=shape, steps=steps) if gradients else None
-    bend = kernels.load(bending, shape=shape, steps=steps)
-    return Landing(bend, adjoint, slice(3, spec.path_control_points - fixed_at_goal))
-
-
-def _lanes(values: Array) -> NDArray[np.float64]:
-    """Turn (N, ...) into (width, N), float64."""
-    return np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64)
+    interior = slice(3, problem.trajectory.path_control_points - FIXED_AT_GOAL)
+    return Landing(kernels.load(path_bend, steps=steps), kernels.load(path_bend_adjoint, steps=steps), interior)

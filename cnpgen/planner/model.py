@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from cnpgen.network.architecture import Architecture, Weights
 from cnpgen.network.features import Features
 from cnpgen.network.forward import forward
-from cnpgen.network.omega import ControlPoints, control_points
 from cnpgen.network.tasks import Tasks
 from cnpgen.plans.problem import ProblemRecord
 
@@ -31,6 +30,19 @@ class Meaning:
     path_scale: float
     bending_steps: int
     landing_steps: int
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a network says of N tasks.
+
+    Attributes:
+        offsets: What interior path control points are off the line by [rad], shape (N, interior points x n).
+        rate: Rate control points [1/s], shape (N, R).
+    """
+
+    offsets: NDArray[np.float64]
+    rate: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,16 +69,13 @@ class Model:
     training: Mapping[str, Any] = field(default_factory=dict)
     log: str = ""
 
-    def control_points(self, tasks: Tasks) -> ControlPoints:
-        """Plan N tasks, before the landing: the network in float32, boundary control points and all sums in float64."""
+    def outputs(self, tasks: Tasks) -> Outputs:
+        """Ask the network for N tasks: in float32 itself, sums and the exponential in float64."""
         given = forward(self._weights, self.features.of(tasks))
-        return control_points(
-            tasks,
-            given.path.astype(np.float64),
-            given.log_rate.astype(np.float64),
-            scale=self.meaning.path_scale,
-            spec=self.problem.trajectory,
-        )
+        offsets = self.meaning.path_scale * given.path.astype(np.float64)
+        if tasks.correction is not None:
+            offsets += tasks.correction.reshape(offsets.shape)
+        return Outputs(offsets, np.exp(given.log_rate.astype(np.float64)) / tasks.expected_time[:, None])
 
     @cached_property
     def _weights(self) -> Weights:

@@ -62,5 +62,5 @@ def prepare_tasks(problem: Problem, robot: "Robot", kernels: KernelLibrary, *, b
         kernels: Where kernels are loaded from.
         bending_steps: Gauss-Newton steps of the baseline; 0 leaves it straight, as a problem without equalities must.
     """
-    baseline = make_baseline(problem, kernels, steps=bending_steps) if bending_steps else None
+    baseline = make_baseline(kernels, steps=bending_steps) if bending_steps else None
     return Preparation(problem, robot.velocity_limit, kernels.load(tip_position), baseline)

@@ -12,7 +12,9 @@ from cnpgen.losses.metric import Metric
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.schedule import suggested_weights
 from cnpgen.network.architecture import Architecture, initial_parameters
+from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
+from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.store.documents import plain
 from cnpgen.training.margins import suggested_margins
 from cnpgen.training.rows import Rows, prepare_rows, resting
@@ -52,7 +54,6 @@ def prepare_run(
         bending_steps=settings.bending_steps,
         landing_steps=settings.landing_steps,
         slow_down=len(rest) == 3,  # all of them
-        gradients=True,
     )
     rows, features = prepare_rows(boundary, kit.prepare)
     if settings.imitation:
@@ -62,7 +63,7 @@ def prepare_run(
     held_out = source.boundary(source.validation, check_rows)
     architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
     run = Run(
-        learner=Learner(architecture, given.problem.trajectory, loss, settings, kit.landing),
+        learner=Learner(architecture, given.problem.trajectory, loss, settings, _landing(given, settings)),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
@@ -104,6 +105,12 @@ def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Bou
         path_outputs=given.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),
         rate_outputs=spec.rate_control_points,
     )
+
+
+def _landing(given: Surroundings, settings: TrainingSettings) -> Landing | None:
+    if settings.landing_steps == 0 or count_equalities(given.robot, given.problem) == 0:
+        return None
+    return make_landing(given.problem, given.kernels, steps=settings.landing_steps)
 
 
 def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:

@@ -1,0 +1,102 @@
+"""Control points as SX functions: the bent line that plans deviate from, and whole paths bent onto the manifold.
+
+Each is one kernel: at one plan at a time its call costs less than a few operations of NumPy. Boundary conditions come
+as one column: start_q, start_dq, start_ddq, goal_q, goal_dq.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.planner.bending import bend
+from cnpgen.recipes import Problem
+from cnpgen.robots.symbolic import Vec, symbols
+from cnpgen.trajectory.spline import end_derivatives
+
+if TYPE_CHECKING:
+    from cnpgen.recipes import TrajectorySpec
+    from cnpgen.robots.robot import Robot
+
+FIXED_AT_GOAL = 2  # control points: goal accelerations are free
+
+
+def line_bend(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+    """Build ``(ends, rate, tops) -> change`` of the interior control points on the line, at a constant rate [1/s]."""
+    import casadi as ca
+
+    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * robot.n), symbols("tops", len(problem.obstacle))
+    rate = ca.SX.sym("rate")
+    points = _points(ends, [rate] * problem.trajectory.rate_control_points, problem.trajectory)
+    change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
+    return ca.Function("line_bend", [ends_sx, rate, tops_sx], [ca.cse(_column(change))])
+
+
+def landed_path(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+    """Build ``(ends, offsets, rates, tops) -> path``: line plus offsets [rad], bent, with boundary control points."""
+    import casadi as ca
+
+    spec, n = problem.trajectory, robot.n
+    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * n), symbols("tops", len(problem.obstacle))
+    rates_sx, rates = symbols("rates", spec.rate_control_points)
+    offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - FIXED_AT_GOAL) * n)
+    points, interior = _points(ends, rates, spec), slice(3, -FIXED_AT_GOAL)
+    points[interior] = _sums(points[interior], _split(offsets, n))
+    if steps:
+        change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
+        points[interior] = _sums(points[interior], change)
+    return ca.Function("landed_path", [ends_sx, offsets_sx, rates_sx, tops_sx], [ca.cse(_column(points))])
+
+
+def path_bend(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+    """Build ``(path, tops) -> change`` of the interior control points."""
+    import casadi as ca
+
+    path, tops, change = _path_bend(robot, problem, steps)
+    return ca.Function("path_bend", [path, tops], [ca.cse(change)])
+
+
+def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+    """Build ``(path, tops, seed) -> gradient`` of ``seed . change`` with respect to the path, by the reverse mode."""
+    import casadi as ca
+
+    path, tops, change = _path_bend(robot, problem, steps)
+    seed = ca.SX.sym("seed", change.numel())
+    gradient = ca.densify(ca.jtimes(change, path, seed, True))
+    return ca.Function("path_bend_adjoint", [path, tops, seed], [ca.cse(gradient)])
+
+
+def _path_bend(robot: "Robot", problem: Problem, steps: int) -> tuple[Any, Any, Any]:
+    points = problem.trajectory.path_control_points
+    (path_sx, path), (tops_sx, tops) = symbols("path", points * robot.n), symbols("tops", len(problem.obstacle))
+    change = bend(robot, problem, _split(path, robot.n), tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
+    return path_sx, tops_sx, _column(change)
+
+
+def _points(ends: Vec, rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+    """Control points of the line, boundary ones first and last (paper, Appendix A; ``trajectory.boundary``)."""
+    q, dq, ddq, goal_q, goal_dq = _split(ends, len(ends) // 5)
+    path = end_derivatives(spec.path_control_points, spec.degree)
+    slope = end_derivatives(spec.rate_control_points, spec.degree).eta * (rates[1] - rates[0])
+    c1, c2, before = [], [], []
+    for x, v, a, goal, arrival in zip(q, dq, ddq, goal_q, goal_dq, strict=True):
+        first = v / rates[0]
+        second = (a - first * slope * rates[0]) / rates[0] ** 2
+        c1.append(x + first / path.eta)
+        c2.append(second / path.beta - 2 * x + 3 * c1[-1])
+        before.append(goal - arrival / rates[-1] / path.eta)
+    count = spec.path_control_points - 3 - FIXED_AT_GOAL
+    along = [i / (count - 1) for i in range(count)]
+    line = [[a + (b - a) * t for a, b in zip(c2, before, strict=True)] for t in along]
+    return [q, c1, c2, *line, before, goal_q]
+
+
+def _split(values: Vec, n: int) -> list[Vec]:
+    return [values[i : i + n] for i in range(0, len(values), n)]
+
+
+def _sums(points: list[Vec], others: list[Vec]) -> list[Vec]:
+    return [[x + y for x, y in zip(*pair, strict=True)] for pair in zip(points, others, strict=True)]
+
+
+def _column(points: list[Vec]) -> Any:
+    import casadi as ca
+
+    return ca.vertcat(*[value for point in points for value in point])
