@@ -184,7 +184,11 @@ def test_a_truncated_model_an_unknown_one_and_a_file_that_is_none_are_one_line_e
     cut = Path(shutil.copy(trained, tmp_path / "cut.h5"))
     cut.write_bytes(cut.read_bytes()[:2000])
     folder, rest = str(tiny("airhockey-hit")), ["-o", str(tmp_path / "p.h5")]
-    for model, code, word in ((str(cut), 1, "cut off"), ("airhockey-hot", 2, "unknown model"), ("x.h5", 2, "not there")):
+    for model, code, word in (
+        (str(cut), 1, "cut off"),
+        ("airhockey-hot", 2, "unknown model"),
+        ("x.h5", 2, "not there"),
+    ):
         found, text = failing(capsys, ["plan", folder, "--model", model, *rest])
         assert (found, text.count("\n")) == (code, 1)
         assert word in text

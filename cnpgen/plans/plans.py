@@ -214,8 +214,8 @@ def _mistakes(plans: Plans) -> Iterator[str]:
 
 def _rows(plans: Plans) -> int:
     """Return how many plans most of the fields are about: the others are wrong."""
-    fields = [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
-    fields += [part for part in _parts(plans.boundary) if part is not None]
+    fields: list[NDArray[Any]] = [part for part in _parts(plans.boundary) if part is not None]
+    fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()
     return Counter(len(field) if field.ndim else 0 for field in fields).most_common(1)[0][0]
 
