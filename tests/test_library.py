@@ -99,7 +99,7 @@ validation = 100
 @pytest.fixture(autouse=True)
 def _kinds(monkeypatch):
     kinds = {
-        STAGES: {"roll": f"{__name__}:Roll"},
+        STAGES: {"roll": "example_stages:Roll"},
         CONSTRAINTS: {"level": f"{__name__}:Level", "still": f"{__name__}:Still"},
     }
     monkeypatch.setattr(plugins, "BUILT_IN", kinds)

@@ -86,7 +86,7 @@ def test_resolved_is_plain_json_with_everything_referred_to(recipe):
     assert json.loads(json.dumps(plain)) == plain
     (stage,) = plain["pipeline"]["stage"]
     assert len(stage.pop("source")) == 64  # the digest of a plug-in's code
-    assert stage == {"use": f"{__name__}:Roll", "size": [0.0, 1.0]}
+    assert stage == {"use": "example_stages:Roll", "size": [0.0, 1.0]}
     assert plain["pipeline"]["problem"]["limits"]["acceleration_cap"] == 20.0
     assert plain["version"] == "1.0.0"
     assert "path" not in plain

@@ -10,13 +10,14 @@ from example_plans import PROBLEMS, ROBOTS, Plan, load
 from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
+from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.grid import make_grid
-from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.jury import Jury
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.sqp import Bounds, Settings, minimise
+from cnpgen.refine.sqp import Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Outcome, Refined, Task
 from cnpgen.refine.transcription import Stage, Transcription

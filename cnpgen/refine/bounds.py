@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.recipes import Problem
-from cnpgen.refine.sqp import Bounds
 from cnpgen.refine.stage import residual_scale
 
 if TYPE_CHECKING:
@@ -34,6 +33,30 @@ class Tightening:
     gentle: float
     clearance: float
     band: float
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of the residuals on the grid, in scaled units.
+
+    Attributes:
+        lower: Shape (K, m), -inf where there is none.
+        upper: Shape (K, m).
+        sharp: Which residuals leap with the last rate control points, shape (K, m): accelerations at the ends.
+    """
+
+    lower: Array
+    upper: Array
+    sharp: NDArray[np.bool_]
+
+    def excess(self, g: Array) -> Array:
+        """How far residuals g are outside, shape (K, m); negative inside."""
+        return np.maximum(g - self.upper, self.lower - g)
+
+    def violation(self, g: Array) -> float:
+        """Worst violation of residuals g, shape (K, m); inf where g is not finite."""
+        worst = float(self.excess(g).max())
+        return max(worst, 0.0) if np.isfinite(worst) else np.inf
 
 
 class BoundsTemplate:

@@ -1,15 +1,12 @@
 """The quadratic programme of one step: which residuals it holds, and its solution by DAQP."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.transcription import Evaluation, Transcription
-
-if TYPE_CHECKING:
-    from cnpgen.refine.sqp import Bounds
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,7 +51,7 @@ class Model:
 
     motion: Transcription
     at: Evaluation
-    bounds: "Bounds"
+    bounds: Bounds
     violation: float
     proximal: float
     penalty: float
@@ -120,7 +117,7 @@ class Model:
         return rows, np.where(above > 0, -INFINITE, lower - g), np.where(below > 0, INFINITE, upper - g)
 
 
-def choose(g: Array, bounds: "Bounds", *, thin: int, near: float, leaps: Array) -> Mask:
+def choose(g: Array, bounds: Bounds, *, thin: int, near: float, leaps: Array) -> Mask:
     """Pick the residuals that matter, shape (K, m).
 
     They are close to a bound, and at a local maximum, active, or on the thinned grid; or they are sharp and may leap

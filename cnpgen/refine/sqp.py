@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.quadratic import Mask, Model, Step, choose
 from cnpgen.refine.transcription import Evaluation, Transcription
 
@@ -49,30 +50,6 @@ class Settings:
 
 
 DEFAULT = Settings()
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds of the residuals on the grid, in scaled units.
-
-    Attributes:
-        lower: Shape (K, m), -inf where there is none.
-        upper: Shape (K, m).
-        sharp: Which residuals leap with the last rate control points, shape (K, m): accelerations at the ends.
-    """
-
-    lower: Array
-    upper: Array
-    sharp: Mask
-
-    def excess(self, g: Array) -> Array:
-        """How far residuals g are outside, shape (K, m); negative inside."""
-        return np.maximum(g - self.upper, self.lower - g)
-
-    def violation(self, g: Array) -> float:
-        """Worst violation of residuals g, shape (K, m); inf where g is not finite."""
-        worst = float(self.excess(g).max())
-        return max(worst, 0.0) if np.isfinite(worst) else np.inf
 
 
 @dataclass(frozen=True)
