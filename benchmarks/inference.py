@@ -65,8 +65,9 @@ def main() -> None:
     for each in found:
         target = TARGETS[each["batch"]] if each["what"] == "network" else None
         cells = (Path(each["model"]).stem, each["what"], str(each["batch"]), f"{each['ms_per_plan']:.4f}")
-        rows.append((*cells, *verdict(each["ms_per_plan"], target, at_most=True)))
-    head = ("model", "what", "batch", "ms per plan", "target", "")
+        ratio = f"{each['ms_per_plan'] / target:.2f}" if target else ""
+        rows.append((*cells, *verdict(each["ms_per_plan"], target, at_most=True), ratio))
+    head = ("model", "what", "batch", "ms per plan", "target", "", "of it")
     report({"inference": found}, [table("planning", head, rows, left=2)], as_json=chosen.json)
 
 

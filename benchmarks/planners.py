@@ -1,0 +1,131 @@
+"""The shipped planners on fresh problems, and what ``--refine`` makes of their plans.
+
+Problems come from a seed that nothing was trained on. The clock is the process's CPU time, one BLAS thread; a plan's
+share of the verdict is in the refiner's time. "T / refined" is the mean motion time before over that after refining.
+
+    python benchmarks/planners.py
+    python benchmarks/planners.py --full      # as many problems as the targets are about
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from common import arguments, median, progress, report, table, verdict
+
+from cnpgen.evaluation import evaluate_plans
+from cnpgen.planner.model_file import shipped_models
+from cnpgen.planner.planner import Planner
+from cnpgen.plans import Plans
+from cnpgen.refine.engine import refine_part
+from cnpgen.refine.options import DEFAULT
+from cnpgen.refine.task import Refined
+from cnpgen.solving import draw_problems
+from cnpgen.threads import one_thread
+from cnpgen.trajectory.motion import Motion
+
+PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000, "heavy-object": 300}
+SHORT = {"planned": 500, "refined": 40}
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a figure is to reach.
+
+    Attributes:
+        value: The bound.
+        at_most: Whether it is an upper one.
+    """
+
+    value: float
+    at_most: bool = False
+
+
+TARGETS = {
+    "airhockey-hit": {
+        "strict": Target(0.95), "loose": Target(0.999), "z error [mm s]": Target(0.2, at_most=True),
+        "T / refined": Target(1.02, at_most=True), "refined valid": Target(0.995),
+        "refine, median ms": Target(10, at_most=True),
+    },
+    "airhockey-replan": {
+        "strict": Target(0.85), "loose": Target(0.97), "refined valid": Target(0.995),
+        "refine, median ms": Target(12, at_most=True),
+    },
+    "heavy-object": {
+        "strict": Target(0.95), "loose": Target(0.985), "vertical error [rad s]": Target(0.012, at_most=True),
+        "T / refined": Target(1.04, at_most=True), "refined valid": Target(0.98),
+        "refine, median ms": Target(45, at_most=True),
+    },
+}  # fmt: skip
+
+
+def judge(plans: Plans) -> dict[str, float]:
+    """Say what plans are worth as the network gave them."""
+    summary = evaluate_plans(plans).summary()
+    metrics = summary["metrics_of_all"]
+    named = {"z error [mm s]": "z_error_mm_s", "vertical error [rad s]": "vertical_error_rad_s"}
+    found = {"strict": summary["valid_ratio"], "loose": summary["paper_valid_ratio"]}
+    found["motion time [s]"] = metrics["duration_s"]["mean"]
+    return found | {name: metrics[key]["mean"] for name, key in named.items() if key in metrics}
+
+
+def refine(plans: Plans) -> dict[str, float]:
+    """Refine plans one by one; compare times where the result is valid."""
+    refined: list[Refined] = []
+    seconds: list[float] = []
+    refine_part(plans.select(slice(1)), DEFAULT)  # kernels
+    with one_thread():
+        for index in range(len(plans)):
+            begun = time.process_time()
+            refined += refine_part(plans.select(slice(index, index + 1)), DEFAULT)
+            seconds.append(time.process_time() - begun)
+    good = np.array([each.valid for each in refined])
+    motion = Motion(np.stack([each.path for each in refined]), np.stack([each.rate for each in refined]), plans.degree)
+    return {
+        "T / refined": float(plans.duration[good].mean() / motion.duration()[good].mean()),
+        "refined valid": float(good.mean()),
+        "refine, median ms": 1e3 * median(seconds),
+        "refine, mean ms": 1e3 * float(np.mean(seconds)),
+        "refine, p95 ms": 1e3 * float(np.quantile(seconds, 0.95)),
+    }
+
+
+def measure(name: str, seed: int, planned: int, refined: int) -> dict[str, float]:
+    progress(f"{name}: {planned} plans, {refined} of them refined")
+    planner = Planner(name)
+    given = draw_problems(name, max(planned, refined), seed=seed)
+    plans = planner.plan_batch(given.boundary)
+    return {**judge(plans.select(slice(planned))), **refine(plans.select(slice(refined)))}
+
+
+def rows_of(name: str, found: dict[str, float]) -> list[tuple[str, ...]]:
+    rows = []
+    for what, value in found.items():
+        target = TARGETS.get(name, {}).get(what)
+        cells = verdict(value, target and target.value, at_most=bool(target and target.at_most))
+        ratio = f"{value / target.value:.3f}" if target else ""
+        rows.append((name, what, f"{value:,.4g}", *cells, ratio))
+    return rows
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--models", nargs="+", default=list(shipped_models()), help="by default all that are shipped")
+    parser.add_argument("--full", action="store_true", help="1,000 plans of each, and as many refined as targets say")
+    parser.add_argument("--seed", type=int, default=987_654_321, help="of the problems")
+
+
+def main() -> None:
+    chosen = arguments(__doc__, options)
+    found: dict[str, Any] = {}
+    for name in chosen.models:
+        sizes = (PLANNED, REFINED.get(name, 300)) if chosen.full else (SHORT["planned"], SHORT["refined"])
+        found[name] = measure(name, chosen.seed, *sizes)
+    rows = [row for name, values in found.items() for row in rows_of(name, values)]
+    head = ("planner", "figure", "value", "target", "", "of target")
+    report({"planners": found}, [table("shipped planners on fresh problems", head, rows, left=2)], as_json=chosen.json)
+
+
+if __name__ == "__main__":
+    main()
