@@ -16,6 +16,7 @@ from cnpgen.store.places import require_folder
 from cnpgen.store.plan import DatasetPlan, load_plan
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise, unfinished
+from cnpgen.store.workspace import is_dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +147,12 @@ def inspect_dataset(folder: str | Path) -> Inspection:
     """
     folder = Path(folder)
     require_folder(folder)
-    if not (folder / PLAN).exists():
+    if not is_dataset(folder):
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
-    plan = load_plan(folder)
+    try:
+        plan = load_plan(folder)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; 'cnpgen validate' says what to do") from error
     summary = summarise(folder, plan, allow_partial=True)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     sealed = (folder / MANIFEST).is_file()

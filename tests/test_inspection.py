@@ -114,6 +114,16 @@ def test_a_document_that_is_not_as_it_was_written_is_damage(hits, tmp_path, name
     assert found.rows == {"train": 182, "validation": 18}
 
 
+@pytest.mark.parametrize(("content", "message"), [(None, "plan.json is missing"), (b"{", "plan.json is damaged: ")])
+def test_without_its_plan_a_dataset_is_not_inspected_but_still_a_dataset(hits, tmp_path, content, message):
+    folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
+    (folder / "plan.json").unlink()
+    if content is not None:
+        (folder / "plan.json").write_bytes(content)
+    with pytest.raises(DatasetError, match=rf"{message}.*; 'cnpgen validate' says what to do"):
+        inspect_dataset(folder)
+
+
 def test_what_is_no_dataset_is_refused(tmp_path):
     with pytest.raises(UsageError, match="not there"):
         inspect_dataset(tmp_path / "nothing")

@@ -56,5 +56,5 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
     if arguments.split is not None or arguments.first is not None:
         raise UsageError("--split and --first are for the folder of a dataset; fresh draws of a recipe have --seed")
     if arguments.n is None:
-        raise UsageError("--n says how many fresh problems are drawn: it is needed with a recipe")
+        raise UsageError(f"{arguments.what} is no folder; of a recipe, --n says how many fresh problems are drawn")
     return draw_problems(arguments.what, arguments.n, seed=arguments.seed)
