@@ -208,8 +208,8 @@ def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list
         if not findings:
             return True, []
         damaged = list(dict.fromkeys(finding.file for finding in findings))
-        what = findings[0] if sealed else f"{MANIFEST}: it was missing, though every shard is there"
-        warnings.warn(f"written again: {what}", RuntimeWarning, stacklevel=3)
+        if sealed:  # without a manifest the dataset was unfinished: a run may have ended just before
+            warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
     finalize(job.folder, notes=notes)
     return True, damaged
 

@@ -88,7 +88,8 @@ def test_a_damaged_document_is_noticed_and_written_again(tiny, folder, name, act
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         made = make_tiny(folder)
-    assert [str(item.message).startswith(f"written again: {name}: ") for item in said] == [True]
+    unfinished = name == MANIFEST and action == "delete"  # what was begun and not finished is no damage
+    assert [str(item.message).startswith(f"written again: {name}: ") for item in said] == [True] * (not unfinished)
     assert (made.made, made.complete, made.mended) == (0, True, (name,))
     assert snapshot(folder) == snapshot(tiny("airhockey-hit"))
 

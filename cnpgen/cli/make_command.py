@@ -141,7 +141,7 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) ->
 def _unmade(made: "MadeDataset", part: tuple[int, int] | None) -> str:
     """Say in what state a dataset was of which no row had to be made."""
     if made.mended:
-        return f"every row was there, {', '.join(made.mended)} written again"
+        return f"every row was there already, {', '.join(made.mended)} written now"
     return f"already {'made' if part else 'complete'}"
 
 
