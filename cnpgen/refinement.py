@@ -149,10 +149,9 @@ def _assembled(given: Plans, refined: list[Refined]) -> Refinement:
         rate_control_points=np.stack([each.rate for each in refined]),
         columns={**given.columns, **_columns(refined)},
     )
-    valid = np.array([each.valid for each in refined])
-    unknown = np.where(screen(plans) == PlanStatus.UNKNOWN, PlanStatus.INVALID, screen(plans))
-    status = np.where(valid, PlanStatus.VALID, unknown).astype(np.uint8)
-    return Refinement(given, replace(plans, status=status), tuple(refined))
+    valid, screened = np.array([each.valid for each in refined]), screen(plans)
+    status = np.where(valid, PlanStatus.VALID, np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened))
+    return Refinement(given, replace(plans, status=status.astype(np.uint8)), tuple(refined))
 
 
 def _columns(refined: list[Refined]) -> Mapping[str, Array]:
