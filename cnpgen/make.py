@@ -47,7 +47,7 @@ class MadeDataset:
         made: Rows made by this call.
         complete: Whether every shard is there and the manifest is written.
         rows: Split -> rows that this call was about: all, or those of its part.
-        mended: Files that were damaged and are made again.
+        mended: Files that were damaged and are made again, documents that were missing and are written.
     """
 
     folder: Path
