@@ -124,10 +124,10 @@ def test_a_file_without_plans_is_the_same_error_for_every_command(
 
 def test_a_motion_that_is_too_long_is_told_what_would_look_at_it(run: Run, saved: Callable[[Plans], Path]) -> None:
     plan = load("transport")
-    slow = saved(plans_of(plan.changed(rate=plan.motion.rate / 60)))
+    slow = saved(plans_of(plan.changed(rate=plan.motion.rate / 180)))
     code, out, _ = run(slow, "--list")
     assert code == 1
-    text = "80.3 s are more than 60,000 steps of 1 ms; with a longer --step it is looked at"
+    text = "241 s are more than 200,000 steps of 1 ms; with a longer --step it is looked at"
     assert f"plan 0: {text}" in " ".join(out.split())
     assert out.splitlines()[-1].endswith(text)
     assert run(slow, "--step", "10ms")[0] == 0

@@ -11,7 +11,7 @@ from cnpgen.trajectory.spline import basis
 Array = NDArray[np.float64]
 
 FEWEST = 200  # samples of a motion
-LONGEST = 60_000  # time steps that a motion may take: a minute at 1 ms, which takes a second to look at
+LONGEST = 200_000  # time steps that a motion may take: three minutes at 1 ms, which take a second to look at
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
 CELLS = 4096  # of equal size in the table of times
 PER_SPAN = 4  # samples between two knots, evenly in phase
