@@ -9,9 +9,9 @@ from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
 
 _TEXT = (
     """\
-The plans may come from any planner; docs/plan-format.md says how ten lines write a file of them. No plan comes back
-worse than it was given: violations count first, then the objective. Plans whose control points are no numbers are made
-from nothing.
+The plans may come from any planner; docs/plan-format.md says how ten lines write a file of them, and how trajectories
+that are sampled in time become plans. No plan comes back worse than it was given: violations count first, then the
+objective. Plans whose control points are no numbers, or that take longer than a minute, are made from nothing.
 """
     + TEXT
 )
