@@ -1,19 +1,44 @@
-"""CasADi's own solvers on the same transcription, for users who want them or want to compare."""
+"""CasADi's own solvers on the same transcription, for users who want them or want to compare.
 
+A programme with every residual on the grid costs Ipopt's linear solver 0.2 s a step, and almost all of them are far
+from their bounds. So it holds those on a coarser grid and where they are largest; what the end of a run breaks is taken
+in, and the next run goes on from there.
+"""
+
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.sqp import Bounds, Result, Settings
-from cnpgen.refine.transcription import Evaluation, Transcription
+from cnpgen.refine.bounds import Bounds
+from cnpgen.refine.programme import Programme
+from cnpgen.refine.sqp import Result, Settings
+from cnpgen.refine.transcription import Transcription
 
 Array = NDArray[np.float64]
-PATIENCE = 5  # these solvers take smaller steps: they may take this many times as many
+PATIENCE = 6  # these solvers take smaller steps: they may take this many times as many
+ROUNDS = 6
+COARSE = 32  # phases of the coarser grid
+NEAR = 0.03  # peaks this close to their bounds are held
+FAR = 1.0  # what is further from its bounds is not held on the coarser grid either: obstacles 0.1 m away
+QUIET = 8  # iterates among which the objective hardly changes end a run
+FIRST, LATER = 2.5, 0.25  # what hardly is in the first and in later runs, in multiples of the tolerance
+WARM = {
+    "mu_strategy": "monotone",
+    "mu_init": 1e-6,
+    "warm_start_init_point": "yes",
+    "warm_start_bound_push": 1e-5,
+    "warm_start_slack_bound_push": 1e-5,
+    "warm_start_slack_bound_frac": 1e-5,
+    "warm_start_mult_bound_push": 1e-6,
+}
+NEARLY = 0.05  # violation up to which a start is worth staying near
 
 
+@np.errstate(all="ignore")  # a step that ends in what is no number is taken back
 def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, solver: str) -> Result:
-    """Minimise from x with ``ipopt`` (limited-memory Hessian) or ``sqpmethod`` (Gauss-Newton Hessian, DAQP).
+    """Minimise from x with ``ipopt`` (Hessian of the Lagrangian) or ``sqpmethod`` (Gauss-Newton Hessian, DAQP).
 
     Args:
         motion: The transcription.
@@ -22,169 +47,122 @@ def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Set
         settings: Number of iterations and tolerances; trust region and proximal term are the own solver's alone.
         solver: Name of the CasADi plug-in.
     """
-    import casadi as ca
-
-    model = _Model(motion, bounds, x)
-    value, constraints = _callbacks(ca, model)
-    symbol = ca.MX.sym("x", motion.nx)
-    programme = {"x": symbol, "f": value(symbol), "g": constraints(symbol)}
-    limit = max(PATIENCE * settings.max_iterations, 0)
-    options = _options(solver, limit, settings)
-    if solver == "sqpmethod":
-        options["hess_lag"] = _curvature(ca, model, settings.proximal)
-    function = ca.nlpsol("refine", solver, programme, options)
-    best = _Best(model)
-    best.offer(x)
-    try:
-        found = function(x0=x, lbg=model.lower, ubg=model.upper)
-    except RuntimeError:  # a plug-in that stops on numbers that it cannot bear: what it began with is still there
-        found = {"x": ca.DM(x)}
-    if model.interruption is not None:
-        raise model.interruption
-    best.offer(np.asarray(found["x"], float).ravel())
-    iterations = int(function.stats().get("iter_count", 0))
-    at, violation = best.found
-    return Result(at.x, at.cost, violation, iterations)
+    watch = _Watch(bounds, settings)
+    held, multipliers = np.zeros(bounds.lower.shape, bool), np.zeros(bounds.lower.shape)
+    limit, steps, end = PATIENCE * settings.max_iterations, 0, x
+    for number in range(ROUNDS):
+        at = motion.evaluate(end)
+        violation = bounds.violation(at.g)
+        watch.offer(end, at.cost, violation)
+        if steps >= limit or (number > 1 and violation < settings.violation_tolerance):
+            break
+        held |= _choose(at.g, bounds)
+        watch.begin(settings.cost_tolerance * (LATER if number else FIRST))
+        programme = Programme(motion, bounds, held, end)
+        warm = number > 0 or violation < NEARLY
+        options = _options(solver, programme, settings, limit - steps, warm=warm)
+        end, multipliers, taken = _run(programme, watch, end, multipliers, options, solver=solver)
+        steps += taken
+    return Result(watch.x, watch.cost, watch.violation, steps)
 
 
-class _Model:
-    """Objective and bounded residuals as vectors and matrices, evaluated once per x."""
+@dataclass
+class _Watch:
+    """Who looks at every iterate: keeps the best one, and ends a run that gains nothing any more.
 
-    def __init__(self, motion: Transcription, bounds: Bounds, x: Array) -> None:
-        self.motion, self.bounds = motion, bounds
-        self.kept: list[Any] = []  # CasADi does not keep its callbacks alive
-        self._k, self._which = np.nonzero(np.isfinite(bounds.lower) | np.isfinite(bounds.upper))
-        self.lower, self.upper = bounds.lower[self._k, self._which], bounds.upper[self._k, self._which]
-        self._last: Evaluation | None = None
-        self.interruption: BaseException | None = None  # CasADi drops what is raised in its callbacks
-        near = x + 0.01 * np.sin(np.arange(len(x)))  # nowhere special: what is zero here, too, is zero everywhere
-        self.row, self.column = np.nonzero((self._dense(x) != 0) | (self._dense(near) != 0))
-        order = np.lexsort((self.row, self.column))  # CasADi stores columns
-        self.row, self.column = self.row[order], self.column[order]
-
-    def at(self, x: Array) -> Evaluation:
-        if self._last is None or not np.array_equal(self._last.x, x):
-            self._last = self.motion.evaluate(x)
-        return self._last
-
-    def residuals(self, x: Array) -> Array:
-        return self.at(x).g[self._k, self._which]
-
-    def jacobian(self, x: Array) -> Array:
-        """Derivatives of the residuals at ``row`` and ``column``."""
-        return self._dense(x)[self.row, self.column]
-
-    def curvature(self, x: Array, proximal: float) -> Array:
-        return self.at(x).curvature + proximal * np.eye(self.motion.nx)
-
-    def _dense(self, x: Array) -> Array:
-        return self.motion.rows(self.at(x), self._k, self._which)
-
-
-class _Best:
-    """The better of two ends: smaller violation, then smaller cost."""
-
-    def __init__(self, model: _Model) -> None:
-        self._model = model
-        self.found: tuple[Evaluation, float] = None  # type: ignore[assignment]
-
-    def offer(self, x: Array) -> None:
-        at = self._model.at(x)
-        violation = self._model.bounds.violation(at.g)
-        if self.found is None or (violation, at.cost) < (self.found[1], self.found[0].cost):
-            self.found = at, violation
-
-
-def _wrap(  # noqa: PLR0917
-    ca: Any, model: _Model, name: str, inputs: list[Any], output: Any, compute: Any, slope: Any = None
-) -> Any:
-    """Wrap a NumPy function of x as a CasADi function.
-
-    Args:
-        ca: CasADi.
-        model: What keeps the function alive, and what is raised in it.
-        name: Name of the function.
-        inputs: Sparsity patterns of its arguments; the first is x, the others are ignored.
-        output: Sparsity pattern of its result.
-        compute: x -> the result's nonzeros, column by column.
-        slope: The wrapped Jacobian, a function of x and the result, or None.
+    Attributes:
+        bounds: Bounds of all residuals, held or not.
+        settings: Tolerances.
+        x: The best variables: feasible or of the smallest violation, then of the smallest cost.
+        cost: Objective there.
+        violation: Worst violation there.
+        costs: Objectives of the run's iterates, nan where one breaks what is held.
+        little: Relative change of the objective that ends the run.
     """
 
-    class Wrapped(ca.Callback):  # type: ignore[misc]
-        def __init__(self) -> None:
-            ca.Callback.__init__(self)
-            self.construct(name, {})
+    bounds: Bounds
+    settings: Settings
+    x: Array = field(default_factory=lambda: np.empty(0))
+    cost: float = np.inf
+    violation: float = np.inf
+    costs: list[float] = field(default_factory=list)
+    little: float = 0.0
 
-        def get_n_in(self) -> int:
-            return len(inputs)
+    def begin(self, little: float) -> None:
+        """Begin a run that ends where the objective changes by less than ``little``, relatively."""
+        self.costs, self.little = [], little
 
-        def get_n_out(self) -> int:
-            return 1
+    def offer(self, x: Array, cost: float, violation: float) -> None:
+        """Take an iterate in."""
+        enough = self.settings.violation_tolerance
+        if not self.x.size or (max(violation, enough), cost) < (max(self.violation, enough), self.cost):
+            self.x, self.cost, self.violation = x, cost, violation
 
-        def get_sparsity_in(self, index: int) -> Any:
-            return inputs[index]
-
-        def get_sparsity_out(self, _: int) -> Any:
-            return output
-
-        def has_jacobian(self) -> bool:
-            return slope is not None
-
-        def get_jacobian(self, *_: Any) -> Any:
-            return slope
-
-        def eval(self, arguments: list[Any]) -> list[Any]:
-            try:
-                return [ca.DM(output, compute(np.asarray(arguments[0], float).ravel()))]
-            except BaseException as error:
-                model.interruption = error
-                raise
-
-    model.kept.append(Wrapped())
-    return model.kept[-1]
+    def look(self, programme: Programme, x: Array) -> float:
+        """Take an iterate of a run in; return 1 to end it."""
+        at = programme.at(x)
+        self.offer(x, at.cost, self.bounds.violation(at.g))
+        met = programme.violation(x) < self.settings.violation_tolerance
+        self.costs.append(at.cost if met else np.nan)
+        last = self.costs[-QUIET:]
+        return float(len(last) == QUIET and max(last) - min(last) < self.little * at.cost)
 
 
-def _callbacks(ca: Any, model: _Model) -> tuple[Any, Any]:
-    """Wrap objective and residuals."""
-    nx, m, dense = model.motion.nx, len(model.lower), ca.Sparsity.dense
-    x, one, many = dense(nx, 1), dense(1, 1), dense(m, 1)
-    pattern = ca.Sparsity.triplet(m, nx, model.row.tolist(), model.column.tolist())
-    gradient = _wrap(ca, model, "gradient", [x, one], dense(1, nx), lambda at: model.at(at).gradient)
-    jacobian = _wrap(ca, model, "jacobian", [x, many], pattern, model.jacobian)
-    value = _wrap(ca, model, "value", [x], one, lambda at: model.at(at).cost, gradient)
-    return value, _wrap(ca, model, "constraints", [x], many, model.residuals, jacobian)
+def _choose(g: Array, bounds: Bounds) -> NDArray[np.bool_]:
+    """Pick the residuals that a programme holds, shape (K, m): on a coarser grid, where they leap, at their peaks."""
+    excess = bounds.excess(g)
+    outer = np.pad(excess, [(1, 1), (0, 0)], constant_values=-np.inf)
+    peak = np.pad((excess >= outer[:-2]) & (excess >= outer[2:]) & (excess > -NEAR), [(1, 1), (0, 0)])
+    chosen = peak[:-2] | peak[1:-1] | peak[2:] | bounds.sharp
+    every = max(len(g) // COARSE, 1)
+    chosen[::every] |= excess[::every] > -FAR
+    return np.asarray(chosen & (np.isfinite(bounds.lower) | np.isfinite(bounds.upper)))
 
 
-def _curvature(ca: Any, model: _Model, proximal: float) -> Any:
-    """Wrap the Gauss-Newton Hessian in the place of the Lagrangian's."""
-    nx, m, dense = model.motion.nx, len(model.lower), ca.Sparsity.dense
-    inputs = [dense(nx, 1), ca.Sparsity(0, 0), dense(1, 1), dense(m, 1)]
-    hessian = _wrap(ca, model, "hessian", inputs, dense(nx, nx), lambda x: model.curvature(x, proximal).ravel())
-    x, p, f, g = ca.MX.sym("x", nx), ca.MX.sym("p", 0, 0), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
-    names = (["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"])
-    return ca.Function("nlp_hess_l", [x, p, f, g], [hessian(x, p, f, g)], *names)
+def _run(
+    programme: Programme, watch: _Watch, x: Array, multipliers: Array, options: dict[str, Any], *, solver: str
+) -> tuple[Array, Array, int]:
+    """Run a solver once; return where it ended, the multipliers (K, m), and its number of steps."""
+    import casadi as ca
+
+    shapes = {"x": len(x), "f": 1, "g": len(programme.lower), "lam_x": len(x), "lam_g": len(programme.lower)}
+    inputs = [ca.Sparsity.dense(shapes.get(ca.nlpsol_out(i), 0), 1) for i in range(ca.nlpsol_n_out())]
+    callback = programme.callbacks.wrap("look", inputs, ca.Sparsity.dense(1, 1), lambda x, *_: watch.look(programme, x))
+    function = ca.nlpsol("refine", solver, programme.problem(), {**options, "iteration_callback": callback})
+    try:
+        found = function(x0=x, lbg=programme.lower, ubg=programme.upper, lam_g0=programme.held(multipliers))
+    except RuntimeError:  # a plug-in that stops on numbers that it cannot bear: what it began with is still there
+        found = None
+    if programme.callbacks.raised is not None:
+        raise programme.callbacks.raised
+    end = x if found is None else np.array(found["x"].nonzeros())
+    if found is None or not np.isfinite(programme.at(end).g).all():
+        return watch.x, multipliers, max(len(watch.costs), 1)
+    steps = int(function.stats().get("iter_count", 0))
+    return end, programme.multipliers(np.array(found["lam_g"].nonzeros())), max(steps, 1)
 
 
-def _options(solver: str, limit: int, settings: Settings) -> dict[str, Any]:
-    quiet = {"print_time": False, "error_on_fail": False}
+def _options(solver: str, programme: Programme, settings: Settings, limit: int, *, warm: bool) -> dict[str, Any]:
+    quiet = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
     if solver == "ipopt":
         ipopt = {
             "print_level": 0,
             "sb": "yes",
-            "hessian_approximation": "limited-memory",
-            "limited_memory_max_history": 20,
+            "mumps_scaling": 0,  # like the next, it costs half as much again as the factorisation
+            "mumps_permuting_scaling": 0,
             "max_iter": limit,
-            "tol": settings.cost_tolerance / 10,
-            "constr_viol_tol": settings.violation_tolerance,
-            "acceptable_tol": settings.cost_tolerance,
+            "tol": settings.cost_tolerance / 200,  # times the active residuals, what the barrier adds to the objective
+            "constr_viol_tol": settings.violation_tolerance / 2,
+            **(WARM if warm else {"mu_strategy": "adaptive"}),
         }
-        return {**quiet, "ipopt": ipopt}
+        return {**quiet, "ipopt": ipopt, "hess_lag": programme.hessian()}
     return {
         **quiet,
+        "hess_lag": programme.hessian(proximal=settings.proximal),
         "qpsol": "daqp",
         "qpsol_options": {"error_on_fail": False, "print_time": False},
         "max_iter": limit,
-        "tol_pr": settings.violation_tolerance,
+        "tol_pr": settings.violation_tolerance / 2,
         "tol_du": settings.cost_tolerance * 10,
         "print_header": False,
         "print_iteration": False,
