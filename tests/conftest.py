@@ -7,6 +7,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", 
     os.environ[_variable] = "1"  # before NumPy is imported: its result must not depend on the machine's load
 
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -35,7 +36,9 @@ Prepare = Callable[..., PreparedPipeline]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let the tests run where there is no compiler: every dataset is then made after a warning."""
+    """Let the tests run where there is no compiler, every dataset then after a warning, and in the background."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what runs in the background
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if find_compiler() is None:
         config.addinivalue_line("filterwarnings", "ignore:.*running on the NumPy backend:RuntimeWarning")
 
