@@ -1,4 +1,4 @@
-"""What surrounds the network: a baseline on the manifold, and slowing down as far as limits need it and no further."""
+"""What surrounds the network: a line bent onto the manifold, and slowing down as far as limits need and no further."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def worst_tilt(name: str, path: np.ndarray) -> float:
 
 
 def bent_paths(tiny, dataset: str, name: str, steps: int, count: int = 12) -> np.ndarray:
-    """Paths of the baseline alone."""
+    """Paths of the bent line alone."""
     given = surroundings_of(name)
     boundary = boundary_of_columns(columns_of(tiny(dataset)), count)
     tasks = make_kit(given, bending_steps=steps, landing_steps=0, slow_down=False).prepare(boundary)
@@ -90,7 +90,7 @@ def test_a_problem_without_equalities_keeps_the_straight_line(tiny):
 
 @pytest.fixture(scope="module")
 def fast(tiny):
-    """Plans that run the baseline too fast, and what slows them down."""
+    """Plans that run the bent line too fast, and what slows them down."""
     given = surroundings_of("heavy-object")
     boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 12)
     ends = {f"{end}_xyz": columns_of(tiny("heavy-object"))[f"{end}_xyz"][:12] for end in ("start", "goal")}

@@ -22,7 +22,7 @@ class Tasks:
         start_xyz: Tip positions at the start, world frame [m], shape (N, 3).
         goal_xyz: Tip positions at the goal, world frame [m], shape (N, 3).
         expected_time: What the network's rates are multiples of the inverse of [s], shape (N,).
-        correction: What the baseline deviates from the straight line by [rad], shape (N, m, n); None if it is straight.
+        correction: What the bent line deviates from the straight one by [rad], shape (N, m, n); None if it is straight.
     """
 
     boundary: Boundary

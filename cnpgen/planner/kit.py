@@ -118,7 +118,7 @@ def make_kit(given: Surroundings, *, bending_steps: int, landing_steps: int, slo
 
     Args:
         given: The problem.
-        bending_steps: Gauss-Newton steps of the baseline.
+        bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps behind the network.
         slow_down: Whether motions are slowed down; only for those from rest to rest.
     """

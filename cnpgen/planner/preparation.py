@@ -1,4 +1,4 @@
-"""From boundary conditions to tasks: tip positions, obstacles, expected time, baseline; for training and planning."""
+"""From boundary conditions to tasks: tip positions, obstacles, expected time, bent line; for training and planning."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.network.tasks import Tasks, expected_time
-from cnpgen.planner.baseline import Baseline, make_baseline
+from cnpgen.planner.curves import line_bend
 from cnpgen.planner.expressions import tip_position
+from cnpgen.planner.lanes import ends_of, lanes, rows
 from cnpgen.recipes import Problem
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import Boundary
@@ -29,13 +30,13 @@ class Preparation:
         problem: The problem.
         velocity_limit: Planning limits [rad/s], shape (n,).
         tip: Kernel of ``expressions.tip_position``.
-        baseline: What bends the line onto the manifold; None where it stays straight.
+        line: Kernel of ``curves.line_bend``; None where the line stays straight.
     """
 
     problem: Problem
     velocity_limit: Array
     tip: Kernel
-    baseline: Baseline | None
+    line: Kernel | None
 
     def __call__(self, boundary: Boundary) -> Tasks:
         """Prepare N tasks, in float64."""
@@ -44,8 +45,9 @@ class Preparation:
         start_xyz, goal_xyz = tips[:, : len(boundary)].T, tips[:, len(boundary) :].T
         time = expected_time(boundary, self.velocity_limit)
         correction = None
-        if self.baseline is not None:
-            correction = self.baseline.correction(boundary, 1 / time, self.tops(start_xyz, goal_xyz))
+        if self.line is not None:
+            (change,) = self.line(ends_of(boundary), 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
+            correction = rows(change, boundary.start_q.shape[1])
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
 
     def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
@@ -60,7 +62,7 @@ def prepare_tasks(problem: Problem, robot: "Robot", kernels: KernelLibrary, *, b
         problem: The problem.
         robot: Its robot.
         kernels: Where kernels are loaded from.
-        bending_steps: Gauss-Newton steps of the baseline; 0 leaves it straight, as a problem without equalities must.
+        bending_steps: Gauss-Newton steps that bend the line; 0, as where there are no equalities, leaves it straight.
     """
-    baseline = make_baseline(kernels, steps=bending_steps) if bending_steps else None
-    return Preparation(problem, robot.velocity_limit, kernels.load(tip_position), baseline)
+    line = kernels.load(line_bend, steps=bending_steps) if bending_steps else None
+    return Preparation(problem, robot.velocity_limit, kernels.load(tip_position), line)

@@ -20,7 +20,6 @@ class Journal:
         self.path = path
         self.lines = [line for line in _lines(path) if json.loads(line).get("step", 0) <= step] if step else []
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text("".join(f"{line}\n" for line in self.lines), encoding="utf-8")
         except OSError as error:
             raise machine_error("write", path, error) from error

@@ -28,7 +28,7 @@ class TrainingSettings:
         path_scale: What the configuration head's output is a multiple of [rad].
         head_scale: Factor of the heads' first weights.
         rate_bias: Logarithm of the first guess of expected time over duration.
-        bending_steps: Gauss-Newton steps that bend the baseline onto the manifold.
+        bending_steps: Gauss-Newton steps that bend the line onto the manifold.
         landing_steps: Likewise of what the network gives.
         nodes: Quadrature nodes of the loss.
         shifts: So many shifted sets of nodes are used in turn, so that nothing hides between them.

@@ -84,7 +84,8 @@ def train_model(
     if steps is None and epochs is None and cpu_seconds is None:
         cpu_seconds = SECONDS
     length = Length(steps=steps, epochs=epochs, cpu_seconds=cpu_seconds)
-    out, settings, source = Path(out), settings or TrainingSettings(), open_source(folder)
+    out, settings = _checked(Path(out)), settings or TrainingSettings()
+    source = open_source(folder)
     lasts = {name: value for name, value in vars(length).items() if value is not None}
     asked = {"length": lasts, "check_rows": check_rows}
     checkpoints = Checkpoints(out.with_suffix(".checkpoint"), {**identity(source, settings), **asked})
@@ -106,6 +107,12 @@ def train_model(
     save_model(out, model)
     checkpoints.remove()
     return Trained(model, out, score)
+
+
+def _checked(path: Path) -> Path:
+    if path.suffix != ".h5" or path.is_dir() or not path.parent.is_dir():
+        raise UsageError(f"{path} must be a file that ends in .h5, in a folder that exists")
+    return path
 
 
 def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
