@@ -1,0 +1,259 @@
+"""The refiner: how often its plans are valid, how long they take, how good they are, beside ipopt and SLSQP.
+
+CPU times are of one plan on one core; every part runs its variants in turn. Parts:
+
+    grid     81 hits from rest, puck on a 9 x 9 grid, from nothing and from a network-like start
+    fresh    fresh draws of every pipeline: valid share, CPU time, and of each failure what is proven about its problem
+    ipopt    motion time and objective beside Ipopt's from the same start
+    height   what it costs to stay within 0.1 mm of the table's height
+    slsqp    SciPy's SLSQP on the same transcription (the paper's TrajOpt), with exact derivatives
+    workers  plans per second (wall clock) of one process and of two
+
+    python benchmarks/refiner.py                          small sizes, five minutes
+    python benchmarks/refiner.py --full                   1,000 hits, 1,000 replans, 300 transports; 30 beside ipopt
+    python benchmarks/refiner.py --parts fresh --seed 7
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from common import arguments, median, progress, report, table, verdict
+from refiner_problems import Made, grid_of_hits, like_a_networks, make_each
+from slsqp import minimise_slsqp
+
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.problem import open_problem
+from cnpgen.refine.bounds import BoundsTemplate
+from cnpgen.refine.engine import _tasks, load_refiner, prepare
+from cnpgen.refine.jury import Jury
+from cnpgen.refine.options import RefineOptions
+from cnpgen.refine.proof import explain_plans
+from cnpgen.refine.refiner import Passes, Refiner
+from cnpgen.refinement import refine_plans
+from cnpgen.solving import draw_problems
+from cnpgen.trajectory.motion import Motion
+from cnpgen.verify.world import World
+
+PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")
+SMALL = {"fresh": (60, 60, 20), "ipopt": 4, "height": 30, "slsqp": 2, "workers": 100}
+FULL = {"fresh": (1000, 1000, 300), "ipopt": 30, "height": 200, "slsqp": 10, "workers": 400}
+VALID = {"airhockey-hit": 0.995, "airhockey-replan": 0.995, "heavy-object": 0.97}
+LOSS = 1.005  # motion time in Ipopt's
+NARROW = 1e-4  # m, off the table's height
+Result = tuple[dict[str, Any], list[str]]
+
+
+def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
+    """Solve the 81 hits."""
+    problems = grid_of_hits()
+    made = {"from nothing": make_each(problems, RefineOptions())}
+    starts = like_a_networks(problems, made["from nothing"], options.seed)
+    made["network-like start"] = make_each(starts, RefineOptions())
+    targets = {"from nothing": 40.0, "network-like start": 15.0}
+    facts, rows = {}, []
+    for start, found in made.items():
+        valid, ms, judging = sum(each.valid for each in found), cpu(found), judged(found)
+        facts[start] = {"valid": valid, "median_ms": ms, "median_verdict_ms": judging}
+        met = verdict(ms, targets[start], at_most=True)
+        rows.append((start, str(valid), *verdict(valid, 81), *shown(found), f"{judging:.1f}", *met))
+    head = ("start", "valid", "target", "", *SHOWN, "of it verdicts", "target", "")
+    return {"grid": facts}, [table("81 hits from rest, CPU time per plan [ms]", head, rows)]
+
+
+def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
+    """Solve fresh draws of every pipeline."""
+    facts, rows, failures = {}, [], []
+    for name, count in zip(PIPELINES, sizes["fresh"], strict=True):
+        progress(f"{count} of {name}")
+        problems = draw_problems(name, count, seed=options.seed)
+        found = make_each(problems, RefineOptions())
+        share = float(np.mean([each.valid for each in found]))
+        mean = float(np.mean([each.ms for each in found]))
+        target = verdict(mean, 65.0 if name != "heavy-object" else None, at_most=True)
+        rows.append((name, *shown(found), f"{share:.2%}", *verdict(share, VALID[name]), f"{mean:.1f}", *target))
+        failed = [index for index, each in enumerate(found) if not each.valid]
+        findings = explain_plans(problems, failed)
+        failures += [(name, str(index), found[index].refined.reason, str(findings[index])) for index in failed]
+        facts[name] = {"valid": share, "mean_ms": mean, "failures": {i: str(findings[i]) for i in failed}}
+    head = ("problems", *SHOWN, "share", "target", "", "mean", "target", "")
+    tables = [table(f"fresh problems, seed {options.seed}, CPU time per plan from nothing [ms]", head, rows)]
+    if failures:
+        tables.append(table("not valid", ("problems", "row", "because", "and its problem is"), failures, left=4))
+    return {"fresh": facts}, tables
+
+
+def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
+    """Compare with Ipopt from the same start, a straight line."""
+    facts, rows, worse = {}, [], []
+    for name in PIPELINES:
+        progress(f"{name} with ipopt")
+        problems = draw_problems(name, sizes["ipopt"], seed=options.seed + 1)
+        own, other = (make_each(problems, RefineOptions(solver=solver)) for solver in ("own", "ipopt"))
+        both = [index for index in range(len(own)) if own[index].valid and other[index].valid]
+        times = np.array([own[i].duration / other[i].duration for i in both])
+        costs = np.array([own[i].refined.cost / other[i].refined.cost for i in both])
+        late = [both[k] for k in np.flatnonzero(times > LOSS)]
+        worse += [f"  {name} row {i}: {own[i].duration:.4f} s, Ipopt's {other[i].duration:.4f} s" for i in late]
+        valid = [sum(each.valid for each in found) for found in (own, other)]
+        speed = cpu(other) / cpu(own)
+        rows.append((name, *map(str, (len(own), *valid)), spread(times), spread(costs), str(len(late)), f"{speed:.0f}"))
+        facts[name] = {"time": times.tolist(), "objective": costs.tolist(), "rows": both, "times_faster": speed}
+    head = ("problems", "n", "valid", "Ipopt's", "motion time", "objective", "> 0.5 % later", "times faster")
+    tables = [table("in Ipopt's from the same start, median and largest", head, rows)]
+    if worse:
+        tables.append("\n".join(["", "motion times more than 0.5 % above Ipopt's", *worse]))
+    return {"ipopt": facts}, tables
+
+
+def height(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
+    """Compare the refiner's narrow band around the table's height with the whole tolerance."""
+    facts, rows = {}, []
+    for name in PIPELINES[:2]:
+        problems = draw_problems(name, sizes["height"], seed=options.seed + 2)
+        narrow, wide = make_each(problems, RefineOptions()), make_each(problems, RefineOptions(), wide_band(problems))
+        both = [(a, b) for a, b in zip(narrow, wide, strict=True) if a.valid and b.valid]
+        lost = np.array([a.duration / b.duration - 1 for a, b in both])
+        off = [off_height(problems, found) for found in (narrow, wide)]
+        within = f"{np.mean([each <= NARROW for each in off[0]]):.1%}"
+        worst = (f"{1e3 * max(each):.3f}" for each in off)
+        rows.append((name, str(len(both)), *worst, within, f"{np.median(lost):.3%}", f"{lost.mean():.3%}"))
+        facts[name] = {"off_m": off, "loss": lost.tolist()}
+    head = ("problems", "n", "z off [mm]", "in the whole band", "within 0.1 mm", "time lost, median", "mean")
+    return {"height": facts}, [table("height over the table, the worst of all plans and moments", head, rows)]
+
+
+def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
+    """Compare with SLSQP, from nothing and from network-like starts."""
+    facts, rows = {}, []
+    for name in ("airhockey-hit", "heavy-object"):
+        problems = draw_problems(name, sizes["slsqp"], seed=options.seed + 3)
+        refiner = prepare(problems, RefineOptions())
+        nothing = make_each(problems, RefineOptions())
+        starts = like_a_networks(problems, nothing, options.seed)
+        given = make_each(starts, RefineOptions())
+        for start, plans, own, target in (
+            ("from nothing", problems, nothing, 50.0),
+            ("network-like start", starts, given, 20.0),
+        ):
+            progress(f"SLSQP: {name}, {start}")
+            valid, seconds = run_slsqp(refiner, plans, options.cap)
+            ratio = 1e3 * median(seconds) / cpu(own)
+            counts = str(len(own)), str(sum(each.valid for each in own)), str(sum(valid))
+            rows.append((name, start, *counts, f"{median(seconds):.2f}", f"{ratio:.0f}", *verdict(ratio, target)))
+            facts[f"{name}, {start}"] = {"seconds": seconds, "valid": valid, "ratio": ratio}
+    head = ("problems", "start", "n", "valid", "SLSQP's", "SLSQP, median [s]", "times faster", "target", "")
+    return {"slsqp": facts}, [table(f"beside SLSQP, which is stopped after {options.cap:g} s", head, rows, left=2)]
+
+
+def workers(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
+    """Measure plans per second."""
+    problems = draw_problems("airhockey-hit", sizes["workers"], seed=options.seed + 4)
+    speeds = {}
+    for count in (1, 2):
+        progress(f"{count} worker(s)")
+        start = time.perf_counter()
+        refine_plans(problems, workers=count)
+        speeds[count] = len(problems) / (time.perf_counter() - start)
+    ratio = speeds[2] / speeds[1]
+    rows = [(f"{speeds[1]:.1f}", f"{speeds[2]:.1f}", f"{ratio:.2f}", *verdict(ratio, 1.8))]
+    return {"workers": speeds}, [table("plans per second", ("one", "two", "ratio", "target", ""), rows, left=0)]
+
+
+SHOWN = ("median", "p95", "largest")
+
+
+def shown(found: list[Made]) -> tuple[str, ...]:
+    """CPU times [ms], under ``SHOWN``."""
+    ms = [each.ms for each in found]
+    return tuple(f"{value:.1f}" for value in (*np.percentile(ms, [50, 95]), max(ms)))
+
+
+def cpu(found: list[Made]) -> float:
+    """Median CPU time [ms]."""
+    return median(each.ms for each in found)
+
+
+def judged(found: list[Made]) -> float:
+    """Median CPU time of the verdicts [ms]."""
+    return median(each.verdict_ms for each in found)
+
+
+def spread(ratios: Any) -> str:
+    """Median and largest ratio."""
+    return f"{np.median(ratios):.4f} {ratios.max():.4f}" if len(ratios) else "-"
+
+
+def wide_band(problems: Plans) -> Refiner:
+    """A refiner that lets the tip use most of the tolerance of its height."""
+    problem, robot = open_problem(problems.problem)
+    tool, world = load_refiner(problem, robot), World(problem, robot)
+    wider = {
+        name: replace(each, tightening=replace(each.tightening, band=0.9)) for name, each in vars(tool.passes).items()
+    }
+    tool.passes = Passes(**wider)
+    tool._bounds = {
+        each: BoundsTemplate(problem, world, tool._grids[each.points].s, each.tightening) for each in wider.values()
+    }
+    return tool
+
+
+def off_height(problems: Plans, found: list[Made]) -> list[float]:
+    """How far the tips of valid plans are off the table's height at most, beyond the funnel of the start [m]."""
+    problem, robot = open_problem(problems.problem)
+    jury = Jury(problem, robot, degree=problems.degree)
+    pairs = zip(_tasks(problems, problem), found, strict=True)
+    verdicts = [jury.verdict(task, each.refined.path, each.refined.rate) for task, each in pairs if each.valid]
+    return [each.margins["table height"].excess for each in verdicts]
+
+
+def run_slsqp(refiner: Refiner, plans: Plans, cap: float) -> tuple[list[bool], list[float]]:
+    """Solve plans with SLSQP; return which are valid and the CPU times [s]."""
+    problem, robot = open_problem(plans.problem)
+    jury, valid, seconds = Jury(problem, robot, degree=plans.degree), [], []
+    for task in _tasks(plans, problem):
+        given = refiner.given(task)
+        x = refiner._straight(task) if given is None else given.x
+        end, took = minimise_slsqp(refiner, task, x, cap=cap)
+        path, rate = refiner.check.transcription(task).unpack(end)
+        forward = bool(Motion(path[None], rate[None], plans.degree).runs_forward()[0])
+        valid.append(forward and jury.verdict(task, path, rate).valid)
+        seconds.append(took)
+    return valid, seconds
+
+
+PARTS: dict[str, Callable[[dict[str, Any], argparse.Namespace], Result]] = {
+    each.__name__: each for each in (grid, fresh, ipopt, height, slsqp, workers)
+}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("--parts", metavar="PART", nargs="+", choices=PARTS, default=list(PARTS), help=", ".join(PARTS))
+    parser.add_argument("--full", action="store_true", help="all rows that the documentation's figures are from")
+    parser.add_argument("--n", type=int, help="problems of each part instead")
+    parser.add_argument("--seed", type=int, default=20261, help="of problems that are used for nothing else")
+    parser.add_argument("--cap", type=float, default=60.0, help="CPU seconds after which SLSQP is stopped")
+
+
+def main() -> None:
+    """Run the benchmark."""
+    options = arguments(__doc__, add)
+    sizes: dict[str, Any] = dict(FULL if options.full else SMALL)
+    if options.n is not None:
+        sizes = {name: (options.n,) * 3 if name == "fresh" else options.n for name in sizes}
+    results: dict[str, Any] = {}
+    tables: list[str] = []
+    for name in options.parts:
+        progress(name)
+        facts, found = PARTS[name](sizes, options)
+        results |= facts
+        tables += found
+    report(results, tables, as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Problems and starts of the refiner's benchmark, and what is measured of one plan."""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.library import choose_backend
+from cnpgen.library import load_pipeline
+from cnpgen.pipelines.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.hitting_velocity import HittingVelocity
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.pipelines.stage import Batch
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.problem import open_problem, record_problem
+from cnpgen.refine.engine import _tasks, prepare
+from cnpgen.refine.jury import Jury
+from cnpgen.refine.options import RefineOptions
+from cnpgen.refine.polish import refine_task
+from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.task import Refined, Task
+from cnpgen.refine.tip_bound import Arm
+from cnpgen.solving import problems_of_rows
+from cnpgen.trajectory.motion import Motion
+from cnpgen.verdict.verdict import Verdict
+
+Array = NDArray[np.float64]
+PUCKS_X, PUCKS_Y = np.linspace(0.8, 1.2, 9), np.linspace(-0.4, 0.4, 9)  # m
+GOAL = np.array([2.478, 0.0])  # m, where the puck is sent
+BEHIND = 0.07  # m, from the puck's centre to where the mallet meets it
+LARGEST_Z, SMALLEST_Z, TOO_FAST = 0.010, 0.002, 1.05  # of a network-like start
+
+
+@dataclass(frozen=True)
+class Made:
+    """What came of one plan.
+
+    Attributes:
+        refined: The plan.
+        ms: CPU time, verdicts included [ms].
+        verdict_ms: CPU time of the verdicts [ms].
+        duration: Its motion time [s].
+    """
+
+    refined: Refined
+    ms: float
+    verdict_ms: float
+    duration: float
+
+    @property
+    def valid(self) -> bool:
+        """Whether the verdict calls it valid."""
+        return self.refined.valid
+
+
+class WatchedJury(Jury):
+    """A jury that knows how long it took."""
+
+    seconds = 0.0
+
+    def verdict(self, task: Task, path: Array, rate: Array) -> Verdict:
+        """Judge, and add up the time."""
+        start = time.process_time()
+        try:
+            return super().verdict(task, path, rate)
+        finally:
+            self.seconds += time.process_time() - start
+
+
+def make_each(plans: Plans, options: RefineOptions, refiner: Refiner | None = None) -> list[Made]:
+    """Refine plans one by one in this process, and watch the clock."""
+    tool = prepare(plans, options) if refiner is None else refiner
+    problem, robot = open_problem(plans.problem)
+    jury = WatchedJury(problem, robot, degree=plans.degree)
+    tasks = _tasks(plans, problem)
+    refine_task(tool, jury, tasks[0])  # warms up
+    return [_make(tool, jury, task) for task in tasks]
+
+
+def _make(tool: Refiner, jury: WatchedJury, task: Task) -> Made:
+    jury.seconds, start = 0.0, time.process_time()
+    refined = refine_task(tool, jury, task)
+    ms = 1e3 * (time.process_time() - start)
+    duration = float(Motion(refined.path[None], refined.rate[None], tool.spec.degree).duration()[0])
+    return Made(refined, ms, 1e3 * jury.seconds, duration)
+
+
+def grid_of_hits() -> Plans:
+    """The 81 hits from rest in the base configuration, at the highest speed along the line to the goal."""
+    pipeline = load_pipeline("airhockey-hit")
+    backend, cache_folder = choose_backend(None)
+    context = PreparedPipeline(pipeline, backend=backend, cache_folder=cache_folder).context
+    puck = np.stack(np.meshgrid(PUCKS_X, PUCKS_Y, indexing="ij")).reshape(2, -1)
+    along = (GOAL[:, None] - puck) / np.linalg.norm(GOAL[:, None] - puck, axis=0)
+    batch, base = Batch(puck.shape[1]), context.robot.base
+    height = next(each.z for each in context.problem.constraint if hasattr(each, "start_band"))
+    batch["goal_xyz"] = np.vstack([puck - BEHIND * along, np.full(batch.size, height)])
+    batch["hit_angle"] = np.arctan2(along[1], along[0])[None]
+    for stage in (HittingConfiguration(near="base"), HittingVelocity(full_speed=1.0)):
+        stage.prepare(context)(batch, np.random.default_rng(0))
+    assert not batch.reasons or len(batch.alive) == batch.size
+    columns = {name: values.T for name, values in batch.columns.items()}
+    still = np.zeros((batch.size, context.robot.n))
+    start = {"start_q": still + base, "start_dq": still, "start_ddq": still}
+    start["start_xyz"] = np.tile(Arm(context.robot).at(base).position, (batch.size, 1))
+    columns |= {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed", "hit_speed_max")}
+    return problems_of_rows(record_problem(context.problem), {**columns, **start})
+
+
+def like_a_networks(plans: Plans, made: list[Made], seed: int) -> Plans:
+    """Disturb plans as a network errs: the tip is 2 to 10 mm too high or low somewhere, velocities are 5 % too high."""
+    _, robot = open_problem(plans.problem)
+    random, arm, s = np.random.default_rng(seed), Arm(robot), np.linspace(0, 1, 41)
+    paths, rates = [], []
+    for each in made:
+        path, rate = each.refined.path, each.refined.rate
+        noise = np.zeros_like(path)
+        noise[3:-2] = _smooth(random.normal(size=noise[3:-2].shape))
+        wanted, size = random.uniform(SMALLEST_Z, LARGEST_Z), 4e-3
+        for _ in range(4):
+            size *= wanted / _vertical(arm, path, path + size * noise, s)
+        bent = path + size * noise
+        speed = np.abs(Motion(bent[None], rate[None], plans.degree).at(s).dq[0]) / robot.velocity_limit
+        paths.append(bent)
+        rates.append(rate * TOO_FAST / speed.max())
+    return replace(plans, path_control_points=np.array(paths), rate_control_points=np.array(rates))
+
+
+def _smooth(values: Array) -> Array:
+    for _ in range(2):
+        values = np.apply_along_axis(lambda column: np.convolve(column, [0.25, 0.5, 0.25], "same"), 0, values)
+    return values
+
+
+def _vertical(arm: Arm, path: Array, bent: Array, s: Array) -> float:
+    """Largest vertical distance between the tips of two paths [m]."""
+    q = [Motion(each[None], np.ones((1, 20))).at(s).q[0] for each in (path, bent)]
+    return max(abs(float((arm.at(one).position - arm.at(other).position)[2])) for one, other in zip(*q, strict=True))
