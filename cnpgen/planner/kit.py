@@ -124,6 +124,8 @@ def make_kit(given: Surroundings, *, bending_steps: int, landing_steps: int, slo
     """
     problem, robot, kernels = given.problem, given.robot, given.kernels
     bent = count_equalities(robot, problem) > 0
-    prepare = prepare_tasks(problem, robot, kernels, bending_steps=bending_steps if bent else 0)
-    path = kernels.load(landed_path, steps=landing_steps if bent else 0)
-    return Kit(prepare, path, make_slowing(problem, robot, kernels) if slow_down else None)
+    with kernels.compiling_together():
+        prepare = prepare_tasks(problem, robot, kernels, bending_steps=bending_steps if bent else 0)
+        path = kernels.load(landed_path, steps=landing_steps if bent else 0)
+        slowing = make_slowing(problem, robot, kernels) if slow_down else None
+    return Kit(prepare, path, slowing)
