@@ -66,6 +66,15 @@ def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
     assert trained.read_bytes() == before
 
 
+def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path):
+    path = tmp_path / "m.h5"
+    chosen = ["--growth", "3", "--learning-rate", "2e-3", "--seed", "7", "--metric", "bounded", "--quiet"]
+    assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL, *chosen]) == 0
+    settings = load_model(path).training["settings"]
+    assert (settings["learning_rate"], settings["seed"]) == (2e-3, 7)
+    assert (settings["metric"]["kind"], settings["metric"]["growth"]) == ("learned", 3.0)
+
+
 @pytest.mark.parametrize(("number", "code", "what"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
 def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_path, number, code, what):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL[2:], "--steps", "1e5", "--quiet"]

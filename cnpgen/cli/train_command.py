@@ -2,19 +2,16 @@
 
 import argparse
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.train_text import Watch, summary
 
 if TYPE_CHECKING:
-    from cnpgen.training.run import Run
     from cnpgen.training.settings import TrainingSettings
-    from cnpgen.training.state import State
     from cnpgen.training.train import Trained
 
 _TEXT = """\
@@ -63,7 +60,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    watch = _Watch(quiet=arguments.quiet)
+    watch = Watch(quiet=arguments.quiet)
     try:
         trained = _train(arguments, watch)
     except KeyboardInterrupt as interruption:
@@ -75,12 +72,12 @@ def run(arguments: argparse.Namespace) -> int:
     if trained.made:
         _draw(trained)
     if not arguments.quiet:
-        print(_summary(trained), file=sys.stderr)
+        print(summary(trained), file=sys.stderr)
     print(trained.path)
     return 0
 
 
-def _train(arguments: argparse.Namespace, watch: "_Watch") -> "Trained":
+def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     from cnpgen.training.train import train_model
 
     return train_model(
@@ -124,61 +121,6 @@ def _command(arguments: argparse.Namespace) -> str:
     return " ".join(["cnpgen train", arguments.folder.name, "-o", arguments.out.name, *options])
 
 
-class _Watch:
-    """Shows how training goes."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self._meter, self._quiet = Meter(quiet=quiet, noun="step"), quiet
-        self._last = 0
-        self._seen: Mapping[str, Any] = {}
-
-    def begin(self, state: "State", run: "Run") -> None:
-        """Say what begins."""
-        step, steps = state.adam.step, state.steps
-        self._last = step
-        parameters = run.learner.architecture.n_parameters
-        self._meter.begin(f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step)
-
-    def __call__(self, record: Mapping[str, Any]) -> None:
-        """Show a line of the log."""
-        step = record["step"]
-        self._meter(step - self._last)
-        self._last = step
-        for name in ("imitation", "loss"):
-            if name in record:
-                self._meter.note(f"{name} {record[name]:.4g}")
-        if "loss" in record:
-            self._seen = record
-        if "validation" in record and not self._quiet:
-            print(f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}", file=sys.stderr)
-            if self._seen:
-                print(f"  {_terms(self._seen)}", file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        """Remove the bar."""
-        self._meter.close()
-
-
-def _words(found: Mapping[str, Any]) -> str:
-    words = [f"{found['valid']:.1%} of {found['plans']:,} plans valid", f"{found['duration_s']:.3f} s"]
-    if "z_error_mm_s" in found:
-        words.append(f"z error {found['z_error_mm_s']:.3f} mm s")
-    if "vertical_error_rad_s" in found:
-        words.append(f"vertical error {found['vertical_error_rad_s']:.4f} rad s")
-    broken = sorted(found["broken"].items(), key=lambda item: -item[1])[:3]
-    return ", ".join(words) + (f"; broken: {', '.join(f'{name} {count}' for name, count in broken)}" if broken else "")
-
-
-def _terms(record: Mapping[str, Any]) -> str:
-    """Say how large the terms are, as multiples of their budgets where they have one, and their weights."""
-    words = [f"loss {record['loss']:.4g}, learning rate {record['learning_rate']:.2g}"]
-    for name, weight in record["weights"].items():
-        value, budget = record["terms"][name], record["budgets"][name]
-        against = f"{value / budget:.2g} of its budget" if budget else f"{value:.2g}"
-        words.append(f"{name} {against} (weight {weight:.2g})")
-    return ", ".join(words)
-
-
 def _draw(trained: "Trained") -> None:
     """Draw the learning curve where that is possible."""
     from cnpgen.errors import MachineError
@@ -188,14 +130,3 @@ def _draw(trained: "Trained") -> None:
         plot_curve(trained.model.log, trained.path.with_suffix(".png"))
     except MachineError as error:
         print(f"cnpgen: no learning curve: {error}", file=sys.stderr)
-
-
-def _summary(trained: "Trained") -> str:
-    training = trained.model.training
-    words = _words(trained.score)
-    if not trained.made:
-        return f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
-    return (
-        f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time; the model of step"
-        f" {training['best_step']:,} is kept: {words}"
-    )

@@ -116,12 +116,7 @@ class Run:
         )
 
     def step(self, state: State, gradient: Array) -> None:
-        """Take one step.
-
-        Args:
-            state: Changed in place.
-            gradient: Scratch, shape (n_parameters,).
-        """
+        """Take one step; ``gradient`` is scratch, shape (n_parameters,)."""
         adam, step = state.adam, state.adam.step
         rows = self.rows.take(self.order.batch(step))
         if step < state.imitating:

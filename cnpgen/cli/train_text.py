@@ -1,0 +1,79 @@
+"""What ``cnpgen train`` says: a bar, a line per validation, a summary."""
+
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.cli.progress import Meter
+
+if TYPE_CHECKING:
+    from cnpgen.training.run import Run
+    from cnpgen.training.state import State
+    from cnpgen.training.train import Trained
+
+
+class Watch:
+    """Shows how training goes."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._meter, self._quiet = Meter(quiet=quiet, noun="step"), quiet
+        self._last = 0
+        self._seen: Mapping[str, Any] = {}
+
+    def begin(self, state: "State", run: "Run") -> None:
+        """Say what begins."""
+        step, steps = state.adam.step, state.steps
+        self._last = step
+        parameters = run.learner.architecture.n_parameters
+        self._meter.begin(f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step)
+
+    def __call__(self, record: Mapping[str, Any]) -> None:
+        """Show a line of the log."""
+        step = record["step"]
+        self._meter(step - self._last)
+        self._last = step
+        for name in ("imitation", "loss"):
+            if name in record:
+                self._meter.note(f"{name} {record[name]:.4g}")
+        if "loss" in record:
+            self._seen = record
+        if "validation" in record and not self._quiet:
+            print(f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}", file=sys.stderr)
+            if self._seen:
+                print(f"  {_terms(self._seen)}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Remove the bar."""
+        self._meter.close()
+
+
+def _words(found: Mapping[str, Any]) -> str:
+    words = [f"{found['valid']:.1%} of {found['plans']:,} plans valid", f"{found['duration_s']:.3f} s"]
+    if "z_error_mm_s" in found:
+        words.append(f"z error {found['z_error_mm_s']:.3f} mm s")
+    if "vertical_error_rad_s" in found:
+        words.append(f"vertical error {found['vertical_error_rad_s']:.4f} rad s")
+    broken = sorted(found["broken"].items(), key=lambda item: -item[1])[:3]
+    return ", ".join(words) + (f"; broken: {', '.join(f'{name} {count}' for name, count in broken)}" if broken else "")
+
+
+def _terms(record: Mapping[str, Any]) -> str:
+    """Say how large the terms are, as multiples of their budgets where they have one, and their weights."""
+    words = [f"loss {record['loss']:.4g}, learning rate {record['learning_rate']:.2g}"]
+    for name, weight in record["weights"].items():
+        value, budget = record["terms"][name], record["budgets"][name]
+        against = f"{value / budget:.2g} of its budget" if budget else f"{value:.2g}"
+        words.append(f"{name} {against} (weight {weight:.2g})")
+    return ", ".join(words)
+
+
+def summary(trained: "Trained") -> str:
+    """Say in a line what came of a run."""
+    training = trained.model.training
+    words = _words(trained.score)
+    if not trained.made:
+        return f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
+    return (
+        f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time; the model of step"
+        f" {training['best_step']:,} is kept: {words}"
+    )
