@@ -15,6 +15,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.proof import Finding, Kind, explain_failure, explain_plans
 from cnpgen.refine.reachable import Departure, joint_limits, moments
+from cnpgen.refine.table_proof import table_bounds
 from cnpgen.refine.tip_bound import Arm, bound_projection
 from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems
@@ -154,6 +155,15 @@ def test_an_end_at_rest_near_the_edge_is_not_on_the_verge() -> None:
 def explain_case(plan: Plan) -> Finding:
     ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
     return explain_failure(plan.problem, plan.robot, plan.boundary, **ends)
+
+
+def test_a_motion_that_starts_off_the_table_may_be_that_far_off_for_a_while() -> None:
+    plan = load("hit").with_constraint("Table", start_band=0.0)
+    high = plan.goal_xyz[0] + [0.0, 0.0, 4e-3]
+    for start, off in ((plan.goal_xyz[0], True), (high, False)):
+        bounds = table_bounds(plan.problem, start, tolerances=1.0)
+        assert bounds is not None
+        assert (bounds.exceedance(high)[1] > 0) == off
 
 
 def test_ends_that_break_a_constraint_are_named_with_value_and_bound() -> None:

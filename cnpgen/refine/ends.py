@@ -15,7 +15,7 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.verify.world import World
 
 Array = NDArray[np.float64]
-ROUNDING = 1e-9  # by which a condition must be broken to be called broken, relative to its bound or absolute
+MARGIN = 1e-5  # relative to the bound, or absolute: a motion need not begin and end more exactly
 
 
 def end_mistakes(
@@ -39,26 +39,28 @@ def end_mistakes(
         "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),
         "goal": (boundary.goal_q[0], boundary.goal_dq[0], goal_ddq),
     }
+    world.set_state(*ends["start"], tops)
+    tip = world.tip_position
     for end, state in ends.items():
         world.set_state(*state, tops)
         free = end == "goal" and boundary.goal_ddq is None
         for constraint in problem.constraint:
             for condition in constraint.measured(world):
                 if not (free and condition.needs == 2):
-                    yield from _broken(constraint, condition, start_xyz, end)
+                    yield from _broken(constraint, condition, tip, end)
     if boundary.goal_ddq is None and not _has_acceleration(problem, robot, *ends["goal"][:2]):
         yield "at the goal there is no acceleration within its limits whose torques are within theirs"
 
 
-def _broken(constraint: Constraint, condition: Condition, start_xyz: Array, end: str) -> Iterator[str]:
+def _broken(constraint: Constraint, condition: Condition, start_tip: Array, end: str) -> Iterator[str]:
     """Say whether a measured condition is exceeded by more than its constraint allows."""
     g = np.array(condition.g, float)
-    wider = float(constraint.funnel(condition, np.array([0.0 if end == "start" else 1.0]), start_xyz)[0])
+    wider = float(constraint.funnel(condition, np.array([0.0 if end == "start" else 1.0]), start_tip)[0])
     bound = np.where(g < condition.lower, condition.lower - wider, condition.upper + wider)
     excess = np.maximum(condition.lower - g, g - condition.upper) - wider
     allowed = constraint.allowed(condition)
     worst = int(np.argmax(excess - allowed))
-    if excess[worst] > allowed[worst] + ROUNDING * max(1.0, abs(bound[worst])):
+    if excess[worst] > allowed[worst] + MARGIN * max(1.0, abs(bound[worst])):
         unit = "" if condition.unit == "1" else f" {condition.unit}"
         yield (
             f"at the {end} {condition.name} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-ROUNDING = 1e-9  # rad
+MARGIN = 1e-4  # rad, for what happens between the moments that the verdict looks at
 
 
 class Kind(StrEnum):
@@ -72,7 +72,7 @@ def explain_failure(
     for mistake in _cannot_brake(problem, robot, boundary):
         return Finding(Kind.INFEASIBLE, mistake)
     unknown = Finding(Kind.UNKNOWN, "nothing proves that there is no valid plan")
-    return _off_table(problem, robot, boundary, start_xyz) or unknown
+    return _off_table(problem, robot, boundary) or unknown
 
 
 def explain_plans(plans: "Plans", which: Sequence[int]) -> dict[int, Finding]:
@@ -106,15 +106,15 @@ def _cannot_brake(problem: "Problem", robot: "Robot", boundary: Boundary) -> Ite
     for end, departure in departures(boundary).items():
         for time in times:
             lower, upper = departure.box(float(time), limits)
-            for joint in np.flatnonzero(lower > upper + ROUNDING):
+            for joint in np.flatnonzero(lower > upper + MARGIN):
                 what, name = _moment(end, float(time)), robot.joint_names[joint]
                 over = float(lower[joint] - upper[joint])
                 yield f"{what} {name} is {over:.2g} rad or more outside its range, however it is accelerated"
 
 
-def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary, start_xyz: Array) -> Finding | None:
+def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Finding | None:
     """Say whether the tip must leave a table."""
-    found = find_leaving(problem, robot, boundary, start_xyz=start_xyz)
+    found = find_leaving(problem, robot, boundary)
     if found is None:
         return None
     where, distance = f"{_moment(found.end, found.time)} the tip", f"{1e3 * abs(found.distance):.2g} mm"

@@ -51,7 +51,7 @@ class TableBounds:
         return max(float(excess[~self.height].max()), FLOOR), max(float(excess[self.height].max()), 0.0)
 
 
-def table_bounds(problem: Problem, start_xyz: Array, *, tolerances: float) -> TableBounds | None:
+def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> TableBounds | None:
     """Return the bounds of the problem's tables, or None where it has none.
 
     The height is always held within its tolerance, and within that of the start where that is further away: when the
@@ -59,7 +59,7 @@ def table_bounds(problem: Problem, start_xyz: Array, *, tolerances: float) -> Ta
 
     Args:
         problem: The problem.
-        start_xyz: Tip at the start [m], shape (3,).
+        start_tip: Tip at the start [m], shape (3,).
         tolerances: Fraction of the tolerance by which the rectangles are larger.
     """
     tables = [each for each in problem.constraint if isinstance(each, Table)]
@@ -68,7 +68,7 @@ def table_bounds(problem: Problem, start_xyz: Array, *, tolerances: float) -> Ta
     limits = []
     for table in tables:
         room = tolerances * table.tolerance + SLACK
-        band = table.tolerance + SLACK + abs(float(start_xyz[2]) - table.z) * (table.start_band > 0)
+        band = table.tolerance + SLACK + abs(float(start_tip[2]) - table.z)
         limits += [table.x.high + room, room - table.x.low, table.y.high + room, room - table.y.low]
         limits += [table.z + band, band - table.z]
     normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
@@ -115,19 +115,19 @@ class Leaving:
     proven: bool
 
 
-def find_leaving(problem: Problem, robot: Robot, boundary: Boundary, *, start_xyz: Array) -> Leaving | None:
+def find_leaving(problem: Problem, robot: Robot, boundary: Boundary) -> Leaving | None:
     """Find where the tip must leave a table; where that cannot be proven, where it has less room than ``VERGE``.
 
     Args:
         problem: The problem.
         robot: Its robot.
         boundary: Boundary conditions of one motion.
-        start_xyz: Tip at the start [m], shape (3,).
     """
-    exact, wide = (table_bounds(problem, start_xyz, tolerances=tolerances) for tolerances in (0.0, 1.0))
+    arm, nearly = Arm(robot), None
+    start_tip = arm.at(boundary.start_q[0]).position
+    exact, wide = (table_bounds(problem, start_tip, tolerances=tolerances) for tolerances in (0.0, 1.0))
     if exact is None or wide is None:
         return None
-    arm, nearly = Arm(robot), None
     limits, wider = (joint_limits(problem, robot, tolerances=tolerances) for tolerances in (0.0, 1.0))
     times = moments(boundary, wider)
     for end, departure in departures(boundary).items():
