@@ -68,11 +68,31 @@ def test_lost_files_are_made_again(tiny, folder):
     (folder / "train" / "shard-00001.h5").unlink()
     (folder / "train" / "shard-00002.json").unlink()
     (folder / "validation" / "shard-00000.json").write_text("{")
-    with pytest.warns(RuntimeWarning, match="2 shards are damaged"):
+    with pytest.warns(RuntimeWarning, match="^3 shards are damaged"):
         made = make_tiny(folder)
     assert (made.made, made.complete) == (410, True)
     assert digests(folder) == digests(tiny("airhockey-hit"))
     assert validate_dataset(folder).ok
+
+
+@pytest.mark.parametrize("lost", [[".json"], [".h5"], [".json", ".h5"]], ids=["record", "rows", "both"])
+def test_a_shard_lost_from_a_finished_dataset_is_named_and_the_dataset_unfinished_until_it_is_there(tiny, folder, lost):
+    for ending in lost:
+        (folder / "train" / f"shard-00001{ending}").unlink()
+    sealed: list[tuple[str, bool]] = []
+    with pytest.warns(RuntimeWarning, match=r"^a shard is damaged and is made again: .*shard-00001\.(json|h5) is"):
+        made = make_tiny(folder, begin=lambda step, *_: sealed.append((step, (folder / MANIFEST).exists())))
+    assert sealed == [("checking", True), ("making", False)]
+    assert (made.made, made.complete, made.mended) == (250, True, ("train/shard-00001.h5",))
+    assert digests(folder) == digests(tiny("airhockey-hit"))
+
+
+def test_a_shard_whose_record_was_not_written_before_a_run_ended_is_made_without_a_warning(tiny, folder):
+    for name in (MANIFEST, "train/shard-00001.json"):
+        (folder / name).unlink()
+    made = make_tiny(folder)  # warnings are errors
+    assert (made.made, made.complete, made.mended) == (250, True, ())
+    assert digests(folder) == digests(tiny("airhockey-hit"))
 
 
 @pytest.mark.parametrize("action", ["flip", "cut", "empty", "delete"])

@@ -16,8 +16,12 @@ MOST_THREADS = 8
 
 
 def made_already(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]:
-    """List the shards that were made: those with a sidecar."""
-    return [task for task in tasks if (folder / task.sidecar).exists()]
+    """List the shards that were made: all of a finished dataset, which its manifest tells, else those with a sidecar.
+
+    Without a manifest a shard that has no sidecar is not lost but unfinished: a run that ends between the two leaves it.
+    """
+    finished = (folder / MANIFEST).exists()
+    return [task for task in tasks if finished or (folder / task.sidecar).exists()]
 
 
 def find_damaged(
