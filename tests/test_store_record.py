@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from test_store_example import PLAN, make_columns, make_outcome, make_shard, mak
 
 from cnpgen.errors import DatasetError, MachineError
 from cnpgen.outcome import DensityMap, Outcome, merge_outcomes, outcome_from_json
+from cnpgen.store.check import check_dataset
 from cnpgen.store.files import file_sha256
-from cnpgen.store.plan import shards
+from cnpgen.store.manifest import finalize
+from cnpgen.store.plan import save_plan, shards
 from cnpgen.store.record import (
     commit_shard,
     is_committed,
@@ -73,6 +76,27 @@ def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> Non
     with pytest.raises(DatasetError, match="not finite"):
         commit_shard(tmp_path, PLAN, TASK, columns=columns, outcome=make_outcome(TASK))
     assert not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize("flush", [0, 2], ids=["the shard is flushed", "its record is flushed"])
+def test_a_run_that_finishes_the_dataset_does_not_stop_another_one_in_the_middle_of_a_shard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flush: int
+) -> None:
+    sync, calls = os.fsync, count()
+    save_plan(tmp_path, PLAN)
+
+    def meanwhile(descriptor: int) -> None:
+        if next(calls) == flush:
+            make_shards(tmp_path)
+            finalize(tmp_path)
+        sync(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", meanwhile)
+        record = make_shard(tmp_path, PLAN, TASK)
+    assert record.sha256 == file_sha256(tmp_path / TASK.file)
+    assert not list(tmp_path.rglob("*.tmp"))
+    assert check_dataset(tmp_path) == []
 
 
 @pytest.mark.parametrize("name", ["train/shard-00000.json", "train/shard-00000.h5"])

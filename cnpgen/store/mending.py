@@ -16,9 +16,9 @@ MOST_THREADS = 8
 
 
 def made_already(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]:
-    """List the shards that were made: all of a finished dataset, which its manifest tells, else those with a sidecar.
+    """List the shards that were made: all of a finished dataset, else those with a sidecar.
 
-    Without a manifest a shard that has no sidecar is not lost but unfinished: a run that ends between the two leaves it.
+    Without a manifest a shard that has no sidecar is unfinished, not lost: a run that ends between the two leaves it.
     """
     finished = (folder / MANIFEST).exists()
     return [task for task in tasks if finished or (folder / task.sidecar).exists()]

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.outcome import Outcome, outcome_from_json
 from cnpgen.store.documents import load_document, save_document
 from cnpgen.store.files import file_sha256
@@ -134,6 +134,24 @@ def commit_shard(
     """
     if is_committed(folder, task, plan.fingerprint):  # by somebody to whom the same work was given
         return load_record(folder, task)
+    about = {"outcome": outcome, "started": started, "seconds": seconds, "versions": versions or {}}
+    try:
+        return _write(folder, plan, task, columns, about)
+    except CnpgenError:
+        # somebody may have committed it meanwhile, finished the dataset and swept our temporary file away with theirs
+        if is_committed(folder, task, plan.fingerprint):
+            return load_record(folder, task)
+        raise
+
+
+def _write(
+    folder: Path,
+    plan: DatasetPlan,
+    task: ShardTask,
+    columns: Mapping[str, NDArray[Any]],
+    about: Mapping[str, Any],
+) -> ShardRecord:
+    """Write a shard and then its sidecar, which holds what is said about how the shard came about."""
     path = folder / task.file
     size = write_shard(path, columns, plan.fields, shard_attributes(plan, task), dtype=plan.dtype, work=folder / WORK)
     record = ShardRecord(
@@ -144,10 +162,7 @@ def commit_shard(
         first_sample_id=task.first_row,
         plan_fingerprint=plan.fingerprint,
         statistics=column_statistics(columns, plan.fields),
-        outcome=outcome,
-        started=started,
-        seconds=seconds,
-        versions=versions or {},
+        **about,
     )
     save_record(folder, task, record)
     return record
