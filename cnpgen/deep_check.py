@@ -5,6 +5,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +108,17 @@ def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardChe
         for check in report.failed
     ]
     ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
-    bits = np.ascontiguousarray(np.concatenate(ends, axis=1), np.float64).view(np.uint64)
-    keys = (bits * np.resize(_ODD, bits.shape[1])).sum(axis=1, dtype=np.uint64)
-    return _ShardCheck(report, problems, keys, plans)
+    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans)
+
+
+def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
+    """Hash every row of numbers to 64 bits: equal rows have equal keys, others hardly ever.
+
+    Args:
+        values: Shape (rows, width).
+    """
+    bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
+    bits = bits ^ (bits >> np.uint64(32))  # what was float32 has zeros below, which no product carries upwards
+    bits *= np.resize(_ODD, bits.shape[1])
+    bits ^= bits >> np.uint64(29)
+    return np.asarray((bits * np.resize(_ODD[::-1], bits.shape[1])).sum(axis=1, dtype=np.uint64))

@@ -25,6 +25,8 @@ NEEDED = {  # module -> the project on PyPI that has it
     "joblib": "joblib",
     "psutil": "psutil",
     "tqdm": "tqdm",
+    "daqp": "daqp",
+    "threadpoolctl": "threadpoolctl",
 }
 OPTIONAL = {"matplotlib": "matplotlib"}
 

@@ -18,6 +18,8 @@ MAX_ROWS = 10**12
 def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
     """Return the folder of a dataset: what was asked for, else ``NAME-vMAJOR`` in the current folder.
 
+    A path with ".." behind a folder that is not there yet is resolved: it would be another one once that is made.
+
     Raises:
         UsageError: It has no name.
     """
@@ -25,7 +27,8 @@ def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
         return Path(f"{recipe.name}-v{recipe.version.split('.')[0]}")
     if not str(out).strip():
         raise UsageError(f"out must name a folder, got {str(out)!r}")
-    return Path(out)
+    folder = Path(out)
+    return folder.resolve() if ".." in folder.parts and not folder.parent.exists() else folder
 
 
 def plan_dataset(

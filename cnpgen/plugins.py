@@ -111,8 +111,13 @@ def source_digest(kind: type) -> str:
     What a plug-in computes decides rows and kernels as much as its parameters do.
     """
     package = kind.__module__.partition(".")[0]
+    return "" if package == "cnpgen" else package_digest(package)
+
+
+def package_digest(package: str) -> str:
+    """Hash the source files of an imported top-level package or module; empty if it has none."""
     source = getattr(sys.modules.get(package), "__file__", None)
-    if package == "cnpgen" or not source:
+    if not source:
         return ""
     path = Path(source)
     files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]

@@ -3,8 +3,11 @@
 import dataclasses
 import importlib
 import json
+import re
 import sys
+import tomllib
 import types
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +32,11 @@ def test_this_machine_is_well():
     assert report.hdf5[0].isdigit()
     assert report.free_bytes > 0
     assert "3 datasets" in report.recipes
+
+
+def test_every_dependency_is_looked_for():
+    declared = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert sorted(doctor.NEEDED.values()) == sorted(re.split("[<>=]", each)[0] for each in declared["dependencies"])
 
 
 def test_the_report_is_frozen_and_has_a_json_form():

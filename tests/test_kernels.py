@@ -449,6 +449,25 @@ def test_a_tape_is_built_once_per_builder_loop_parameters_and_problem(tmp_path):
     assert len(BUILT) == 4
 
 
+def test_a_change_anywhere_in_the_package_of_a_plug_in_changes_its_kernels(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "__init__.py").write_text("")
+    (tmp_path / "mine" / "kernels.py").write_text(
+        "import casadi as ca\nfrom mine.helper import FACTOR\n"
+        "def scaled():\n    x = ca.SX.sym('x')\n    return ca.Function('scaled', [x], [FACTOR * x])\n"
+    )
+    use = (
+        "from pathlib import Path; import numpy as np; from mine.kernels import scaled;"
+        "from cnpgen.kernels.library import KernelLibrary;"
+        "print(KernelLibrary('numpy', Path('cache'), 'problem').load(scaled)(np.ones((1, 1)))[0].item())"
+    )
+    for factor in ("2.0", "3.0"):
+        (tmp_path / "mine" / "helper.py").write_text(f"FACTOR = {factor}")
+        command = [sys.executable, "-B", "-c", use]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+        assert done.stdout.strip() == factor
+
+
 def test_a_changed_limit_of_a_problem_changes_its_kernels(prepare: Prepare):
     pipeline = prepare("airhockey-hit").pipeline
     problem = pipeline.problem

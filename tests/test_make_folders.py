@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import tiny_recipe
+from conftest import TINY_SHARD, tiny_recipe
 from tiny_datasets import digests, flip, make_tiny, snapshot
 
 from cnpgen.cli.main import main
@@ -50,9 +50,20 @@ def test_another_recipe_in_the_folder_is_refused_and_not_touched(folder):
     with pytest.raises(UsageError, match=r"holds another dataset \(name airhockey-hit instead of heavy-object"):
         make_tiny(folder, "heavy-object")
     changed = tiny_recipe("airhockey-hit")
-    changed = replace(changed, pipeline=replace(changed.pipeline, title="changed"))
+    stages = changed.pipeline.stage
+    changed = replace(changed, pipeline=replace(changed.pipeline, stage=(*stages, stages[-1])))
     with pytest.raises(UsageError, match=r"holds another dataset \(another recipe\); choose"):
-        make_dataset(changed, folder, workers=1)
+        make_dataset(changed, folder, workers=1, shard_size=TINY_SHARD)
+    assert snapshot(folder) == before
+
+
+def test_a_corrected_title_is_the_same_dataset(folder):
+    before = snapshot(folder)
+    changed = tiny_recipe("airhockey-hit")
+    problem = replace(changed.pipeline.problem, title="other words")
+    changed = replace(changed, pipeline=replace(changed.pipeline, title="corrected", problem=problem))
+    made = make_dataset(changed, folder, workers=1)
+    assert (made.made, made.complete) == (0, True)
     assert snapshot(folder) == before
 
 
@@ -163,6 +174,14 @@ def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force,
     with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another --out"):
         make_tiny(tmp_path, force=force)
     assert snapshot(tmp_path) == before
+
+
+def test_no_detour_hides_what_is_in_a_folder(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "README.md").write_text("mine")
+    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen"):
+        make_tiny(tmp_path / "missing" / ".." / "mine")
+    assert snapshot(tmp_path) == {"mine/README.md": b"mine"}
 
 
 @pytest.mark.parametrize("name", ["train/notes.txt", "thesis.tex", "train/shard-1.h5", "train/shard-00000.h5.bak"])

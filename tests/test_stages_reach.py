@@ -102,6 +102,7 @@ def test_a_stage_that_needs_what_no_stage_wrote_is_a_mistake_in_the_recipe(prepa
     text = str(caught.value)
     assert "stage 1 (ballistic-reach): needs start_xyz, start_tip_velocity, which no stage before it writes" in text
     assert "no stage writes goal_q, which every sample must have" in text
+    assert "no stage writes start_ddq, which every sample must have" in text
 
 
 def test_the_rule_needs_a_table(prepare: Prepare):

@@ -23,6 +23,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
 from cnpgen.kernels.tape import CODES, Dtype, Grid, Loop, Tape, tape_from_function
 from cnpgen.kernels.together import Compilers
+from cnpgen.plugins import package_digest
 from cnpgen.recipes import Problem, resolved
 
 Backend = Literal["compiled", "numpy", "casadi"]
@@ -117,7 +118,7 @@ class KernelLibrary:
 
         identity = {
             "builder": f"{builder.__module__}.{builder.__qualname__}",
-            "source": [_package_digest(), _source_digest(builder)],
+            "source": [_shared_digest(), _source_digest(builder)],
             "versions": [importlib.metadata.version(name) for name in ("casadi", "pin")],
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
@@ -148,19 +149,27 @@ def _store(path: Path, data: bytes) -> None:
 
 
 @cache
-def _package_digest() -> str:
-    """Digest of the package's own SX code: kernels are rebuilt when it changes."""
+def _shared_digest() -> str:
+    """Digest of what builders of several folders use: kernels are rebuilt when it changes."""
     root = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for folder in ("robots", "kernels", "constraints", "pipelines", "losses"):
-        for path in sorted((root / folder).glob("*.py")):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+    return _digest_of(*(root / folder for folder in ("robots", "kernels", "constraints", "trajectory")))
 
 
 def _source_digest(builder: Callable[..., Any]) -> str:
-    source = inspect.getsourcefile(builder)
-    return hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+    """Digest of a builder's folder in this package, or of the whole package that a plug-in's builder comes from."""
+    package, source = builder.__module__.partition(".")[0], inspect.getsourcefile(builder)
+    if package != "cnpgen":
+        return package_digest(package)
+    return _digest_of(Path(source).parent) if source else ""
+
+
+@cache
+def _digest_of(*folders: Path) -> str:
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.glob("*.py")):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
 
 
 def problem_identity(problem: Problem) -> str:

@@ -191,7 +191,7 @@ def _check_needs(pipeline: Pipeline, context: Context) -> set[str]:
             text = f"needs {', '.join(missing)}, which no stage before it writes"
             mistakes.append(f"{pipeline.path}: stage {number} ({kind}): {text}")
         written.update(stage.writes(context))
-    needed = ("start_q", "start_dq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
+    needed = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
     mistakes.extend(
         f"{pipeline.path}: no stage writes {name}, which every sample must have"
         for name in needed

@@ -15,7 +15,7 @@ from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 FORMAT = "cnpgen-plan"
 REVISION = 2  # of the generator: raised by every change after which the same plan would give other rows
 FORMAT_VERSION = 1
-INFORMATIONAL = ("title", "license", "versions")  # what does not make a plan another one
+INFORMATIONAL = ("title", "license", "versions", "recipe")  # what does not make a plan another one; recipe_sha256 does
 
 
 @dataclass(frozen=True)

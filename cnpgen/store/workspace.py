@@ -115,7 +115,10 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Name the settings, besides the number of rows, in which two plans differ."""
     found = []
     for key in old:
-        if key in INFORMATIONAL or key in {"splits", "recipe_sha256"} or old[key] == new[key]:
+        if key in INFORMATIONAL or key == "splits" or old[key] == new[key]:
+            continue
+        if key == "recipe_sha256":
+            found.append("another recipe")
             continue
         plain = isinstance(old[key], str | int)
         found.append(f"{key.replace('_', ' ')} {old[key]} instead of {new[key]}" if plain else f"another {key}")
