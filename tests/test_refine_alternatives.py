@@ -1,5 +1,8 @@
 """CasADi's solvers on the refiner's transcription: exact derivatives, as good as the own one, interruptible."""
 
+import os
+import signal
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +103,21 @@ def test_an_interruption_inside_a_plug_in_is_not_lost(solver: str, monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         minimise_with(motion, tool._bounds[which].of(asked.start_xyz), tool._straight(asked), Settings(), solver=solver)
     assert len(calls) == 7  # and nothing was evaluated afterwards
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("seconds", [0.02, 0.1, 0.25])
+def test_a_signal_is_not_lost_wherever_it_comes(solver: str, seconds: float) -> None:
+    asked, tool = task(load("hit")), refiner("airhockey")
+    which = tool.passes.first
+    motion, bounds, x = tool.transcription(asked, which), tool._bounds[which].of(asked.start_xyz), tool._straight(asked)
+    endless = Settings(max_iterations=100_000, cost_tolerance=1e-300)
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        minimise_with(motion, bounds, x, endless, solver=solver)
+    timer.join()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_callback_that_failed_once_is_not_called_again() -> None:

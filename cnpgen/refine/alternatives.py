@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.programme import Programme
+from cnpgen.refine.signals import Received, signals_held_back
 from cnpgen.refine.sqp import Result, Settings
 from cnpgen.refine.transcription import Transcription
 
@@ -36,7 +37,6 @@ WARM = {
 NEARLY = 0.05  # violation up to which a start is worth staying near
 
 
-@np.errstate(all="ignore")  # a step that ends in what is no number is taken back
 def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, solver: str) -> Result:
     """Minimise from x with ``ipopt`` (Hessian of the Lagrangian) or ``sqpmethod`` (Gauss-Newton Hessian, DAQP).
 
@@ -47,14 +47,20 @@ def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Set
         settings: Number of iterations and tolerances; trust region and proximal term are the own solver's alone.
         solver: Name of the CasADi plug-in.
     """
-    watch = _Watch(bounds, settings)
+    with signals_held_back() as received, np.errstate(all="ignore"):  # steps into what is no number are taken back
+        return _rounds(motion, _Watch(bounds, settings, received), x, solver=solver)
+
+
+def _rounds(motion: Transcription, watch: "_Watch", x: Array, *, solver: str) -> Result:
+    """Run the solver until nothing is broken that it did not hold."""
+    bounds, settings = watch.bounds, watch.settings
     held, multipliers = np.zeros(bounds.lower.shape, bool), np.zeros(bounds.lower.shape)
     limit, steps, end = PATIENCE * settings.max_iterations, 0, x
     for number in range(ROUNDS):
         at = motion.evaluate(end)
         violation = bounds.violation(at.g)
         watch.offer(end, at.cost, violation)
-        if steps >= limit or (number > 1 and violation < settings.violation_tolerance):
+        if watch.received or steps >= limit or (number > 1 and violation < settings.violation_tolerance):
             break
         held |= _choose(at.g, bounds)
         watch.begin(settings.cost_tolerance * (LATER if number else FIRST))
@@ -73,6 +79,7 @@ class _Watch:
     Attributes:
         bounds: Bounds of all residuals, held or not.
         settings: Tolerances.
+        received: Signals that have come meanwhile: one ends the run.
         x: The best variables: feasible or of the smallest violation, then of the smallest cost.
         cost: Objective there.
         violation: Worst violation there.
@@ -82,6 +89,7 @@ class _Watch:
 
     bounds: Bounds
     settings: Settings
+    received: Received
     x: Array = field(default_factory=lambda: np.empty(0))
     cost: float = np.inf
     violation: float = np.inf
@@ -105,7 +113,8 @@ class _Watch:
         met = programme.violation(x) < self.settings.violation_tolerance
         self.costs.append(at.cost if met else np.nan)
         last = self.costs[-QUIET:]
-        return float(len(last) == QUIET and max(last) - min(last) < self.little * at.cost)
+        quiet = len(last) == QUIET and max(last) - min(last) < self.little * at.cost
+        return float(quiet or bool(self.received))
 
 
 def _choose(g: Array, bounds: Bounds) -> NDArray[np.bool_]:
