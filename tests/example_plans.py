@@ -82,6 +82,19 @@ def bent(plan: Plan, by: float, *, seed: int = 0) -> Plan:
     return plan.changed(path=path)
 
 
+def raised(plan: Plan, by: float) -> Plan:
+    """The problem of a plan, starting with the tip ``by`` [m] above the table."""
+    table = next(each for each in plan.problem.constraint if type(each).__name__ == "Table")
+    goal, q = np.r_[plan.start_xyz[0, :2], table.z + by], plan.boundary.start_q[0]
+    model, frame = plan.robot.model, plan.robot.model.getFrameId(plan.robot.tip)
+    data, axes = model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for _ in range(20):
+        pin.computeJointJacobians(model, data, q)
+        off = goal - pin.updateFramePlacement(model, data, frame).translation
+        q = q + np.linalg.pinv(pin.getFrameJacobian(model, data, frame, axes)[:3]) @ off
+    return replace(plan, boundary=replace(plan.boundary, start_q=q[None]), start_xyz=goal[None])
+
+
 @dataclass(frozen=True)
 class Course:
     """A plan evaluated with SciPy's splines and Pinocchio, at many phases."""

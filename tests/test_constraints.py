@@ -357,6 +357,9 @@ def test_funnel_lets_a_motion_down_to_the_table_and_nothing_else_in(benches):
     s, start = np.array([0.0, 0.1, 0.2, 0.3, 1.0]), np.array([0.8, 0.1, 0.157])
     rectangle, height = KINDS["table"].measured(benches["airhockey"].state(benches["airhockey"].robot.base))
     np.testing.assert_allclose(KINDS["table"].funnel(height, s, start), [0.003, 0.003, 0.0015, 0.0, 0.0], atol=1e-15)
+    far = np.array([[0.8, 0.1, 0.36], [0.8, 0.1, 0.1], [0.8, 0.1, 0.163]])  # no further than start_band
+    widths = np.array([[5e-3], [5e-3], [3e-3]]) * [1.0, 1.0, 0.5, 0.0, 0.0]
+    np.testing.assert_allclose(KINDS["table"].funnel(height, s, far), widths, atol=1e-15)
     for name, kind in KINDS.items():
         for condition in kind.measured(benches["heavy-object"].state(0.1)) if name != "table" else (rectangle,):
             np.testing.assert_array_equal(kind.funnel(condition, s, start), np.zeros(5))

@@ -232,16 +232,17 @@ def test_margins_cost_what_the_same_limits_in_the_problem_file_would():
     assert (found.terms[:, [2, 3, 5]] > given.evaluated(loss("airhockey")).terms[:, [2, 3, 5]]).all()
 
 
-def test_a_motion_that_starts_off_the_table_is_given_the_funnel_s_way_to_it():
+@pytest.mark.parametrize(("start", "allowed"), [(0.163, 0.003), (0.19, 0.005)], ids=["in the band", "beyond it"])
+def test_a_motion_that_starts_off_the_table_is_given_the_funnel_s_way_to_it(start: float, allowed: float):
     of, given = loss("airhockey", nodes=32), batch("hit", 2, by=0.1)
     table, column = PROBLEMS["airhockey"].constraint[-1], -1
-    tips = np.array([[0.65, 0.0, 0.19], [0.65, 0.0, 0.16]])
+    tips = np.array([[0.65, 0.0, start], [0.65, 0.0, 0.16]])
     found = given.evaluated(of, start_tip=tips).terms
     at_once = given.evaluated(of).terms
     np.testing.assert_allclose(found[1], at_once[1], rtol=1e-13)
     s, weights = quadrature("cosine", 32)
     at = states(given.path[0], given.rate[0], s)
-    band = 0.03 * np.clip((0.3 - s) / 0.2, 0, 1)
+    band = allowed * np.clip((0.3 - s) / 0.2, 0, 1)
     height = np.array([_tip(of, q)[2] for q in at.q])
     saved = huber(height - table.z) - huber(np.maximum(np.abs(height - table.z) - band, 0))
     assert at_once[0, column] - found[0, column] == pytest.approx((weights / at.rate) @ saved, rel=1e-9)

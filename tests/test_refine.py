@@ -5,11 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from example_plans import PROBLEMS, ROBOTS, Plan, load
+from example_plans import PROBLEMS, ROBOTS, Plan, load, raised
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
+from cnpgen.recipes import Problem
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.grid import make_grid
@@ -39,8 +40,13 @@ def library(name: str) -> KernelLibrary:
 
 @cache
 def refiner(name: str, criterion: Criterion | None = None) -> Refiner:
-    problem, robot = PROBLEMS[name], ROBOTS[name]
-    return Refiner(problem, robot, kernels=library(name), world=World(problem, robot), criterion=criterion)
+    return refiner_of(PROBLEMS[name], criterion)
+
+
+def refiner_of(problem: Problem, criterion: Criterion | None = None, **options: object) -> Refiner:
+    """The refiner of a problem whose residuals are those of the shipped one."""
+    robot, kernels = ROBOTS[problem.name], library(problem.name)
+    return Refiner(problem, robot, kernels=kernels, world=World(problem, robot), criterion=criterion, **options)
 
 
 def tops(plan: Plan) -> np.ndarray:
@@ -57,7 +63,9 @@ def verdict(plan: Plan, boundary: Boundary, path: np.ndarray, rate: np.ndarray) 
 
 def refine(plan: Plan, boundary: Boundary | None = None, **given: np.ndarray) -> Refined:
     jury = Jury(plan.problem, plan.robot, degree=plan.problem.trajectory.degree)
-    return refine_task(refiner(plan.problem.name), jury, task(plan, boundary, **given))
+    shipped = plan.problem is PROBLEMS[plan.problem.name]
+    tool = refiner(plan.problem.name) if shipped else refiner_of(plan.problem)
+    return refine_task(tool, jury, task(plan, boundary, **given))
 
 
 def transcription(
@@ -166,6 +174,37 @@ def test_a_disturbed_plan_is_repaired_and_not_much_slower(label: str) -> None:
     found = refine(plan, path=bent, rate=plan.motion.rate[0] * 1.04)
     assert found.valid
     assert duration(found) < 1.02 * plan.motion.duration()[0]
+
+
+@pytest.mark.parametrize(
+    ("band", "up"), [(5e-3, 4e-3), (5e-3, 5.8e-3), (0.0, 8e-4), (0.0, -8e-4)], ids=["band", "beyond", "above", "below"]
+)
+def test_a_start_off_the_table_by_what_the_verdict_allows_is_planned_in_the_first_pass(band: float, up: float) -> None:
+    plan = raised(load("hit"), up).with_constraint("Table", start_band=band)
+    found = refine(plan)
+    assert found.outcome is Outcome.SOLVED
+    assert verdict(plan, plan.boundary, found.path, found.rate).valid
+
+
+@pytest.mark.parametrize("band", [5e-3, 0.0])
+def test_a_plan_from_further_off_the_table_than_the_start_band_is_not_valid(band: float) -> None:
+    high = raised(load("hit"), 0.2)
+    allowed = high.with_constraint("Table", start_band=0.2)
+    found = refine(allowed)
+    assert verdict(allowed, high.boundary, found.path, found.rate).valid
+    narrow = high.with_constraint("Table", start_band=band)
+    refused = verdict(narrow, high.boundary, found.path, found.rate)
+    assert refused.reason == "off the table"
+    assert refused.worst.excess == pytest.approx(0.2 - band, abs=1e-6)
+    assert not refine(narrow, path=found.path, rate=found.rate).valid
+
+
+def test_a_goal_off_the_table_by_what_the_verdict_allows_is_planned_in_the_first_pass() -> None:
+    plan = load("hit")
+    low = plan.with_constraint("Table", z=float(plan.goal_xyz[0, 2]) + 5e-4)
+    found = refine(low)
+    assert found.outcome is Outcome.SOLVED
+    assert verdict(low, low.boundary, found.path, found.rate).valid
 
 
 def test_a_plan_that_is_good_comes_back_no_worse() -> None:

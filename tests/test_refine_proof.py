@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from example_plans import ROBOTS, Plan, load
+from example_plans import ROBOTS, Plan, load, raised
 
 from cnpgen.cli.main import main
 from cnpgen.plans.plans import Plans
@@ -158,12 +158,19 @@ def explain_case(plan: Plan) -> Finding:
 
 
 def test_a_motion_that_starts_off_the_table_may_be_that_far_off_for_a_while() -> None:
-    plan = load("hit").with_constraint("Table", start_band=0.0)
-    high = plan.goal_xyz[0] + [0.0, 0.0, 4e-3]
-    for start, off in ((plan.goal_xyz[0], True), (high, False)):
-        bounds = table_bounds(plan.problem, start, tolerances=1.0)
+    on = load("hit").goal_xyz[0]
+    for band, start, off in ((0.005, 0.0, True), (0.005, 4e-3, False), (0.0, 4e-3, True), (0.005, 0.2, False)):
+        problem = load("hit").with_constraint("Table", start_band=band).problem
+        bounds = table_bounds(problem, on + [0.0, 0.0, start], tolerances=1.0)
         assert bounds is not None
-        assert (bounds.exceedance(high)[1] > 0) == off
+        assert (bounds.exceedance(on + [0.0, 0.0, 4e-3])[1] > 0) == off
+        assert bounds.exceedance(on + [0.0, 0.0, 7e-3])[1] > 0
+
+
+def test_a_start_further_off_the_table_than_allowed_is_infeasible() -> None:
+    plan = raised(load("hit"), 6e-3).with_constraint("Table", start_band=0.0, tolerance=3e-3)
+    assert "at the start table height is 0.166 m, expected 0.16 m" in explain_case(plan).text
+    assert explain_case(raised(plan, 2e-3)).kind is Kind.UNKNOWN
 
 
 def test_ends_that_break_a_constraint_are_named_with_value_and_bound() -> None:

@@ -46,11 +46,19 @@ class Table(Constraint):
     def funnel(
         self, condition: Condition, s: NDArray[np.float64], start_tip: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Let a motion that starts off the table reach it: all of its height until s = 0.1, nothing from s = 0.3 on."""
+        """Let a motion that starts off the table reach it: ``start_off`` until s = 0.1, nothing from s = 0.3 on."""
         if condition.name != "table height":
             return np.zeros((*start_tip.shape[:-1], len(s)))
         open_: NDArray[np.float64] = np.clip((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0, 1.0)
-        return np.asarray(np.abs(start_tip[..., 2:] - self.z) * open_)
+        return self.start_off(start_tip)[..., None] * open_
+
+    def start_off(self, start_tip: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far off the table motions may begin [m]: as far as they do, up to ``start_band``.
+
+        Args:
+            start_tip: Positions of the tip at the start [m], shape (..., 3).
+        """
+        return np.minimum(np.abs(start_tip[..., 2] - self.z), self.start_band)
 
     def _position(self, tip: list[Any], band: float) -> tuple[Condition, ...]:
         low, high = np.array([self.x.low, self.y.low]), np.array([self.x.high, self.y.high])

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points
 EDGE = 0.05  # phase over which tightening fades in: boundary states may sit on a limit
+EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exceed within the tolerances
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,34 @@ class BoundsTemplate:
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._pairs = pairs
+        self._allowed = np.concatenate([each.allowed(condition) / _scale(each, condition) for each, condition in pairs])
         needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in pairs])
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
         self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = needs == 2
 
-    def of(self, start_tip: Array) -> Bounds:
-        """Return the bounds of the motion that starts with the tip at ``start_tip`` [m], shape (3,)."""
+    def of(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:
+        """Return the bounds of one motion.
+
+        Args:
+            start_tip: Where the tip is at the start [m], shape (3,).
+            ends: Residuals of the boundary states, shape (2, m), nan where they are free. Bounds near an end that is
+                off by no more than the verdict allows are as wide as that: no motion could meet narrower ones.
+        """
+        bounds = self._of(start_tip)
+        return bounds if ends is None else self._eased(bounds, ends)
+
+    def _eased(self, bounds: Bounds, ends: Array) -> Bounds:
+        lower, upper = bounds.lower, bounds.upper
+        for g, row, s in ((ends[0], 0, self._s), (ends[1], -2, 1 - self._s)):  # the last row has bounds of few only
+            open_ = np.clip((EASE[1] - s) / (EASE[1] - EASE[0]), 0.0, 1.0)[:, None]
+            above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
+            if np.any(above > 0):
+                upper = np.asfortranarray(upper + np.minimum(above, self._allowed) * open_)
+            if np.any(below > 0):
+                lower = np.asfortranarray(lower - np.minimum(below, self._allowed) * open_)
+        return Bounds(lower, upper, bounds.sharp)
+
+    def _of(self, start_tip: Array) -> Bounds:
         lower, upper = self._lower, self._upper
         column = 0
         for constraint, condition in self._pairs:

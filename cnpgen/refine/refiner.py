@@ -168,7 +168,8 @@ class Refiner:
         """Run one pass from x."""
         settings = replace(which.settings, radius=min(which.settings.radius, WARM_RADIUS)) if warm else which.settings
         motion = self.transcription(task, which)
-        return self._minimise(motion, self._bounds[which].of(task.start_xyz), x, settings)
+        bounds = self._bounds[which].of(task.start_xyz, ends=motion.end_residuals())
+        return self._minimise(motion, bounds, x, settings)
 
     def transcription(self, task: Task, which: Pass) -> Transcription:
         """Return the motion on the grid of a pass."""

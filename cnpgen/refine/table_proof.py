@@ -54,8 +54,8 @@ class TableBounds:
 def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> TableBounds | None:
     """Return the bounds of the problem's tables, or None where it has none.
 
-    The height is always held within its tolerance, and within that of the start where that is further away: when the
-    motion comes down to the table depends on its phase, not on time.
+    The height is always held within its tolerance, and a motion that starts off the table may be as far off as the
+    table's ``start_off`` all along: when it must have come down depends on its phase, not on time.
 
     Args:
         problem: The problem.
@@ -68,7 +68,7 @@ def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> Ta
     limits = []
     for table in tables:
         room = tolerances * table.tolerance + SLACK
-        band = table.tolerance + SLACK + abs(float(start_tip[2]) - table.z)
+        band = table.tolerance + SLACK + float(table.start_off(start_tip))
         limits += [table.x.high + room, room - table.x.low, table.y.high + room, room - table.y.low]
         limits += [table.z + band, band - table.z]
     normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]

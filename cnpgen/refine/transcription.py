@@ -110,6 +110,15 @@ class Transcription:
         (g,) = self.stage.values(w, self._tops)
         return self.objective(path, rate), g.T
 
+    def end_residuals(self) -> Array:
+        """Evaluate residuals at the start and at the goal, shape (2, m); nan where the goal's acceleration is free."""
+        b, unit = self.boundary, np.array([1.0, 0.0])  # with r = 1 and r' = 0, w is the state itself
+        goal_ddq = np.full(self.n, np.nan) if b.goal_ddq is None else b.goal_ddq[0]
+        start = np.concatenate([b.start_q[0], b.start_dq[0], b.start_ddq[0], unit])
+        goal = np.concatenate([b.goal_q[0], b.goal_dq[0], goal_ddq, unit])
+        (g,) = self.stage.values(np.stack([start, goal], axis=1), self._tops[:, :2])
+        return np.asarray(g.T)
+
     def objective(self, path: Array, rate: Array) -> float:
         """Return the objective of a motion [s]: its duration and the criterion, without what fixes the gauge.
 
