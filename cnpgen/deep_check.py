@@ -38,10 +38,10 @@ class DeepCheck:
         findings: What is wrong, by file.
     """
 
-    rows: RowReport | None
-    judged: int
-    valid: int
-    findings: list[Finding]
+    rows: RowReport | None = None
+    judged: int = 0
+    valid: int = 0
+    findings: tuple[Finding, ...] = ()
 
 
 def check_rows(
@@ -69,7 +69,7 @@ def check_rows(
         findings.append(Finding("(all splits)", f"{counted(twice, 'row')} that stand in the dataset before, too"))
     reports = [check.report for check in checks if check.report is not None]
     judged, valid = (sum(getattr(check.plans, what) for check in checks) for what in ("judged", "valid"))
-    return DeepCheck(merge(reports) if reports else None, judged, valid, findings)
+    return DeepCheck(merge(reports) if reports else None, judged, valid, tuple(findings))
 
 
 @dataclass(frozen=True)

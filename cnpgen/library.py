@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from cnpgen import plugins
 from cnpgen.constraints.constraint import Constraint
-from cnpgen.errors import PluginError, RecipeError, nearest
+from cnpgen.errors import PluginError, RecipeError, UsageError, nearest
 from cnpgen.parsing import Reader, parse
 from cnpgen.pipelines.stage import Stage
 from cnpgen.recipe_checks import problem_mistakes, tables
@@ -68,6 +68,24 @@ def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = 
         RecipeError: With every mistake in all three files.
     """
     return _load(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
+
+
+def dataset_recipe_of(recipe: object) -> DatasetRecipe:
+    """Return the dataset recipe that is meant: itself, or what its name or file says.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: With every mistake in the files.
+    """
+    if isinstance(recipe, DatasetRecipe):
+        return recipe
+    if isinstance(recipe, str | Path):
+        return load_dataset_recipe(recipe)
+    expected = "the name of a dataset or pipeline, the path of a recipe file or a DatasetRecipe"
+    if isinstance(recipe, Pipeline):
+        rows = f'DatasetRecipe(name={recipe.name!r}, pipeline=..., splits={{"train": 1000}})'
+        raise UsageError(f"recipe must be {expected}, got a Pipeline: make {rows} of it (cnpgen.recipes)")
+    raise UsageError(f"recipe must be {expected}, got {recipe!r}")
 
 
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:

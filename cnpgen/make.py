@@ -1,5 +1,6 @@
 """Making datasets: the plan, what is there already, sharing out the rest, the manifest."""
 
+import operator
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
@@ -8,9 +9,11 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
+from cnpgen.arguments import integer
 from cnpgen.certification import certified
+from cnpgen.data_card import load_notes
 from cnpgen.errors import UsageError
-from cnpgen.library import load_dataset_recipe
+from cnpgen.library import dataset_recipe_of
 from cnpgen.make_plan import dataset_folder, plan_dataset
 from cnpgen.make_shard import Job, make_shards
 from cnpgen.outcome import Outcome
@@ -18,7 +21,7 @@ from cnpgen.pipelines.stage import BLOCK_ROWS
 from cnpgen.recipes import DatasetRecipe
 from cnpgen.store.check import check_documents
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.manifest import finalize
+from cnpgen.store.manifest import finalize, source_date
 from cnpgen.store.mending import discard, find_damaged, made_already
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.record import pending
@@ -99,36 +102,36 @@ def make_dataset(
         progress: Called with (rows, outcome) of every shard that was made, and (rows, None) of every one compared.
 
     Raises:
-        RecipeError: The recipe has mistakes.
-        UsageError: An argument makes no sense, or the folder holds something else.
+        RecipeError: The recipe has mistakes, or its data card cannot be read.
+        UsageError: An argument makes no sense, SOURCE_DATE_EPOCH does not, or the folder holds something else.
         MachineError: No working backend, a full disk, a dead worker; run again to go on.
         DatasetError: The plan in the folder is damaged.
     """
     _check(workers, part, force=force)
-    loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
+    loaded = dataset_recipe_of(recipe)
     loaded = certified(loaded) if certify else loaded
+    notes = load_notes(loaded)
     check_place(dataset_folder(loaded, out))
-    job = plan_dataset(
-        loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=not force
-    )
-    if force:
-        clear_dataset(job.folder)
-    open_workspace(job.folder, job.plan)
-    job = replace(job, plan=load_plan(job.folder))  # begun perhaps by another version: shards say what the plan says
+    resume = not force
+    job = plan_dataset(loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=resume)
+    job = _opened(job, force=force)
     mine = _part(shards(job.plan), part)
     waiting, damaged = _take_stock(job, mine, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in mine)
         begin("making", job.folder, rows, rows - sum(task.rows for task in waiting))
-    made = 0
-    with closing(_make(job, waiting, workers)) as results:
-        for rows, outcome in results:
-            made += rows
-            if progress is not None:
-                progress(rows, outcome)
-    complete, documents = _finish(job, _notes(loaded), made=made, alone=part is None)
+    made = _make(job, waiting, workers, progress)
+    complete, documents = _finish(job, notes, made=made, alone=part is None)
     rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.plan.splits}
     return MadeDataset(job.folder, job.plan, made, complete, rows_of, (*damaged, *documents))
+
+
+def _opened(job: Job, *, force: bool) -> Job:
+    """Open the folder of a dataset; its plan is perhaps of another version, and shards say what the plan says."""
+    if force:
+        clear_dataset(job.folder)
+    open_workspace(job.folder, job.plan)
+    return replace(job, plan=load_plan(job.folder))
 
 
 def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
@@ -156,7 +159,18 @@ def _take_stock(
     return [task for task in tasks if task not in sound], [task.file for task in damaged]
 
 
-def _make(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Outcome], None, None]:
+def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progress | None) -> int:
+    """Make the shards; return their rows."""
+    made = 0
+    with closing(_results(job, tasks, workers)) as results:
+        for rows, outcome in results:
+            made += rows
+            if progress is not None:
+                progress(rows, outcome)
+    return made
+
+
+def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Outcome], None, None]:
     """Make the shards and yield what became of them as they are committed."""
     workers = worker_count(1 if workers is None and is_quick(job.plan, tasks) else workers, len(tasks))
     groups = runs(job.plan, tasks, workers)
@@ -215,16 +229,20 @@ def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list
 
 
 def _check(workers: int | None, part: tuple[int, int] | None, *, force: bool) -> None:
-    """Refuse arguments that make no sense before anything is touched."""
-    if workers is not None and workers < 1:
-        raise UsageError(f"workers must be at least 1, got {workers}")
-    if part is not None and not (part[1] >= 1 and 0 <= part[0] < part[1]):
-        raise UsageError(f"part must be K/M with 0 <= K < M, got {part[0]}/{part[1]}")
+    """Refuse arguments and an environment that make no sense before anything is touched."""
+    if workers is not None:
+        integer("workers", workers, least=1)
+    if part is not None:
+        _check_part(part)
     if force and part is not None:
         raise UsageError("--force would delete what the other parts have made: remove the folder, then start the parts")
+    source_date()
 
 
-def _notes(recipe: DatasetRecipe) -> str:
-    """Return the data card that is kept beside the dataset's recipe."""
-    card = recipe.path.with_suffix(".md")
-    return card.read_text(encoding="utf-8") if card.is_file() else ""
+def _check_part(part: tuple[int, int]) -> None:
+    try:
+        k, m = map(operator.index, part)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"part must be two integers (K, M) with 0 <= K < M, got {part!r}") from error
+    if not 0 <= k < m:
+        raise UsageError(f"part must be K/M with 0 <= K < M, got {k}/{m}")

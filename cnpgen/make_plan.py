@@ -4,15 +4,18 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arguments import integer
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_dataset_recipe
+from cnpgen.library import dataset_recipe_of
 from cnpgen.make_shard import Job, versions
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest, resolved, split_rows
 from cnpgen.store.plan import DatasetPlan, default_shard_size, load_plan
 
 MAX_ROWS = 10**12
+MAX_SEED = 2**63 - 1
+DTYPES = ("float64", "float32")
 
 
 def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
@@ -25,8 +28,8 @@ def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
     """
     if out is None:
         return Path(f"{recipe.name}-v{recipe.version.split('.')[0]}")
-    if not str(out).strip():
-        raise UsageError(f"out must name a folder, got {str(out)!r}")
+    if not isinstance(out, str | Path) or not str(out).strip():
+        raise UsageError(f"out must name a folder, got {str(out) if isinstance(out, Path) else out!r}")
     folder = Path(out)
     return folder.resolve() if ".." in folder.parts and not folder.parent.exists() else folder
 
@@ -51,10 +54,10 @@ def plan_dataset(
         UsageError: An argument makes no sense.
         MachineError: No working backend.
     """
-    loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
-    total = sum(loaded.splits.values()) if n is None else n
-    if not 1 <= total <= MAX_ROWS:
-        raise UsageError(f"n must be between 1 and {MAX_ROWS}, got {total}")
+    loaded = dataset_recipe_of(recipe)
+    _check(loaded, dtype)
+    total = integer("n", sum(loaded.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
+    root = integer("seed", loaded.seed if seed is None else seed, least=0, most=MAX_SEED)
     folder = dataset_folder(loaded, out)
     begun = _begun(folder, loaded) if resume else None
     if begun is not None:
@@ -69,9 +72,9 @@ def plan_dataset(
         license=loaded.license,
         recipe_sha256=recipe_digest(loaded),
         recipe=resolved(loaded),
-        seed=loaded.seed if seed is None else seed,
+        seed=root,
         splits=split_rows(loaded, total),
-        shard_size=default_shard_size(total, prepared.block_rows) if shard_size is None else shard_size,
+        shard_size=_shard_size(shard_size, total, prepared.block_rows),
         block_rows=prepared.block_rows,
         dtype=dtype,
         backend=chosen,
@@ -80,6 +83,21 @@ def plan_dataset(
         versions=versions(),
     )
     return Job(folder, plan, loaded.pipeline, chosen, cache_folder)
+
+
+def _check(recipe: DatasetRecipe, dtype: str) -> None:
+    """Refuse what no file of a recipe can say, but a recipe that was made in Python."""
+    for split, rows in recipe.splits.items():
+        integer(f"the rows of split {split!r}", rows, least=1)
+    if not recipe.splits:
+        raise UsageError(f"{recipe.name} has no splits: expected rows of at least one, such as {{'train': 1000}}")
+    if dtype not in DTYPES:
+        raise UsageError(f"dtype must be {' or '.join(map(repr, DTYPES))}, got {dtype!r}")
+
+
+def _shard_size(wanted: int | None, rows: int, block_rows: int) -> int:
+    """Return the rows per shard."""
+    return default_shard_size(rows, block_rows) if wanted is None else integer("shard_size", wanted, least=1)
 
 
 def _begun(folder: Path, recipe: DatasetRecipe) -> DatasetPlan | None:

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arguments import integer
 from cnpgen.consistency import check_recipe, check_statistics, restored
-from cnpgen.deep_check import check_rows
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.deep_check import DeepCheck, check_rows
+from cnpgen.errors import DatasetError
 from cnpgen.regeneration import Regeneration, backend_of, make_again
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.layout import PLAN
 from cnpgen.store.places import require_folder
-from cnpgen.store.plan import load_plan, shards
+from cnpgen.store.plan import DatasetPlan, load_plan, shards
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
 from cnpgen.verify.report import RowReport
@@ -122,42 +123,39 @@ def validate_dataset(
         MachineError: The disk fails, or the backend that made the dataset does not work here and blocks are to be
             made again.
     """
-    folder = Path(folder)
+    folder, regenerate = Path(folder), integer("regenerate", regenerate, least=0)
     require_folder(folder)
     if not is_dataset(folder):
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
-    if regenerate < 0:
-        raise UsageError(f"regenerate must not be negative, got {regenerate}")
-    findings = list(check_dataset(folder))
+    findings = check_dataset(folder)
     try:
         plan = load_plan(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    if regenerate:
-        backend_of(folder, plan)
-    if deep or regenerate:
-        with restored(plan):  # what is missing on this machine is said before anything takes long
-            pass
-    wrong = {finding.file for finding in findings if not finding.note}
+    _require_means(folder, plan, deep=deep, regenerate=regenerate)
     present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
+    wrong = {finding.file for finding in findings if not finding.note}
     whole = [task for task in present if task.file not in wrong]
-    checked, again = None, Regeneration()
-    findings += check_recipe(plan)
-    if deep:
-        findings += check_statistics(folder, plan)
-        checked = check_rows(folder, plan, whole, worker_count(workers, len(whole)), progress)
-        findings += checked.findings
-    if regenerate:
-        again = make_again(folder, plan, whole, regenerate)
-        findings += again.findings
+    findings += check_recipe(plan) + (check_statistics(folder, plan) if deep else [])
+    checked = check_rows(folder, plan, whole, worker_count(workers, len(whole)), progress) if deep else DeepCheck()
+    again = make_again(folder, plan, whole, regenerate) if regenerate else Regeneration()
     return ValidationReport(
         folder,
         sum(task.rows for task in present),
-        tuple(findings),
-        deep=None if checked is None else checked.rows,
-        plans=(checked.judged, checked.valid) if checked is not None and checked.judged else None,
+        (*findings, *checked.findings, *again.findings),
+        deep=checked.rows,
+        plans=(checked.judged, checked.valid) if checked.judged else None,
         wanted=regenerate,
         blocks=again.blocks,
         regenerated=again.made,
         identical=again.identical,
     )
+
+
+def _require_means(folder: Path, plan: DatasetPlan, *, deep: bool, regenerate: int) -> None:
+    """Say what is missing on this machine before anything takes long."""
+    if regenerate:
+        backend_of(folder, plan)
+    if deep or regenerate:
+        with restored(plan):
+            pass

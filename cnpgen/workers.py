@@ -11,6 +11,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
+from cnpgen.arguments import integer
 from cnpgen.errors import MachineError, UsageError
 
 _HELD = (signal.SIGINT, signal.SIGTERM)
@@ -25,15 +26,13 @@ def worker_count(workers: int | None, tasks: int) -> int:
     """Decide how many processes share the tasks: what was asked for, else one per available core.
 
     Raises:
-        UsageError: Fewer than one was asked for.
+        UsageError: Fewer than one was asked for, or no whole number.
     """
     if workers is None:
         from joblib import effective_n_jobs
 
         return max(1, min(int(effective_n_jobs(-1)), tasks))  # of the backend that parallel_config names, if any
-    if workers < 1:
-        raise UsageError(f"workers must be at least 1, got {workers}")
-    return max(1, min(workers, tasks))
+    return max(1, min(integer("workers", workers, least=1), tasks))
 
 
 def share_out(

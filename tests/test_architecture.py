@@ -12,12 +12,12 @@ PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
 # Layers from the top of docs/architecture.md downwards; a module may import those of its own layer and above.
 LAYERS = (
-    ("errors", "units", "fields", "outcome", "wording", "threads"),
+    ("errors", "units", "fields", "outcome", "wording", "threads", "arguments"),
     ("workers",),
     ("schema", "parsing"),
     ("constraints", "pipelines.stage"),
     ("plugins",),
-    ("recipes", "recipe_files", "recipe_checks", "library"),
+    ("recipes", "recipe_files", "recipe_checks", "library", "data_card"),
     ("robots",),
     ("kernels",),
     ("pipelines",),

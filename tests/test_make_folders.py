@@ -266,13 +266,13 @@ def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path,
 
 
 WRONG = {
-    "n": ({"n": 0}, "n must be between 1 and"),
-    "negative n": ({"n": -5}, "n must be between 1 and"),
-    "seed": ({"seed": -1}, "seed must not be negative, got -1"),
-    "shard size": ({"shard_size": 0}, "shard size must be at least 1, got 0"),
+    "n": ({"n": 0}, "n must be an integer from 1 to 1000000000000, got 0"),
+    "negative n": ({"n": -5}, "n must be an integer from 1 to 1000000000000, got -5"),
+    "seed": ({"seed": -1}, "seed must be an integer from 0 to 9223372036854775807, got -1"),
+    "shard size": ({"shard_size": 0}, "shard_size must be an integer from 1 on, got 0"),
     "dtype": ({"dtype": "float16"}, "dtype must be 'float64' or 'float32', got 'float16'"),
     "backend": ({"backend": "cuda"}, "backend 'cuda' does not exist"),
-    "workers": ({"workers": 0}, "workers must be at least 1, got 0"),
+    "workers": ({"workers": 0}, "workers must be an integer from 1 on, got 0"),
     "part beyond the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2|--force would delete"),
     "part of nothing": ({"part": (0, 0)}, "part must be K/M|--force would delete"),
 }

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_store_example import FIELDS, PLAN, dataset, make_columns, make_outcome, make_shard, make_shards
 
-from cnpgen.errors import DatasetError, MachineError
+from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store import manifest as manifest_module
 from cnpgen.store.check import check_dataset
 from cnpgen.store.files import file_sha256
@@ -106,7 +106,7 @@ def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch:
     finalize(dataset)
     assert (dataset / "manifest.json").read_bytes() == first
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
-    with pytest.raises(DatasetError, match="SOURCE_DATE_EPOCH is 'yesterday'"):
+    with pytest.raises(UsageError, match="SOURCE_DATE_EPOCH must be whole seconds since 1970, got 'yesterday'"):
         finalize(dataset)
 
 

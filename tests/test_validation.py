@@ -375,9 +375,9 @@ def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(tiny: 
 def test_folders_that_are_none_and_negative_counts_are_refused(damaged: Path, tmp_path):
     with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
         validate_dataset(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match="regenerate must not be negative, got -1"):
+    with pytest.raises(UsageError, match="regenerate must be an integer from 0 on, got -1"):
         validate_dataset(damaged, regenerate=-1)
-    with pytest.raises(UsageError, match="workers must be at least 1, got 0"):
+    with pytest.raises(UsageError, match="workers must be an integer from 1 on, got 0"):
         validate_dataset(damaged, deep=True, workers=0)
 
 

@@ -30,7 +30,7 @@ def test_there_are_no_more_workers_than_tasks():
     assert worker_count(2, 300) == 2
     assert worker_count(5, 0) == 1
     assert 1 <= worker_count(None, 1000) <= (os.cpu_count() or 1)
-    with pytest.raises(UsageError, match="at least 1, got 0"):
+    with pytest.raises(UsageError, match="workers must be an integer from 1 on, got 0"):
         worker_count(0, 3)
 
 

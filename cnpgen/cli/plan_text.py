@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.data_card import load_notes
 from cnpgen.describe import table
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make_plan import plan_dataset
@@ -30,6 +31,7 @@ def plan_text(recipe: "DatasetRecipe", *, force: bool, **settings: Any) -> str:
     Raises:
         CnpgenError: The dataset cannot be made like this.
     """
+    load_notes(recipe)
     job = plan_dataset(recipe, **settings, resume=not force)
     plan = job.plan
     files = shards(plan)

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.columns import tail
-from cnpgen.loader.cut import Cut, integer
+from cnpgen.loader.cut import Cut
 from cnpgen.loader.form import Form
 from cnpgen.loader.kept import Kept, make_kept
 from cnpgen.loader.order import Order

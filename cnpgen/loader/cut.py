@@ -1,9 +1,8 @@
 """How the rows of an epoch are cut into batches, and who gets which rows of them."""
 
-import operator
 from dataclasses import dataclass
-from typing import Any
 
+from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
 
 
@@ -47,18 +46,3 @@ class Cut:
         """Return the number of batches that this worker gets of ``rows`` rows."""
         batches = -(-self.end(rows) // self.batch_size)
         return -(-(batches - self.worker) // self.workers)
-
-
-def integer(name: str, value: Any, *, least: int) -> int:
-    """Return an argument as an integer.
-
-    Raises:
-        UsageError: It is none, or too small.
-    """
-    try:
-        found = operator.index(value)
-    except TypeError:
-        found = least - 1
-    if found < least or isinstance(value, bool):
-        raise UsageError(f"{name} must be an integer from {least} on, got {value!r}")
-    return found

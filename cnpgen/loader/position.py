@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from cnpgen.arguments import integer
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader.cut import integer
 from cnpgen.loader.source import Source
 
 FORMAT = "cnpgen-loader-state"

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.fields import Field
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
@@ -37,6 +37,7 @@ def finalize(folder: Path, *, notes: str = "") -> dict[str, Any]:
 
     Raises:
         DatasetError: Shards are missing, damaged or of another plan; the message says which.
+        UsageError: SOURCE_DATE_EPOCH is no time.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
     summary = summarise(folder, load_plan(folder))
@@ -69,19 +70,32 @@ def load_manifest(folder: Path) -> dict[str, Any]:
     return load_document(folder / MANIFEST, FORMAT, version=FORMAT_VERSION)
 
 
+def source_date() -> datetime | None:
+    """Return the time that the environment variable SOURCE_DATE_EPOCH wants datasets to be made at, if it is set.
+
+    Raises:
+        UsageError: It is no time.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    try:
+        return datetime.fromtimestamp(int(epoch), UTC) if epoch else None
+    except (ValueError, OverflowError, OSError) as error:
+        raise UsageError(f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got {epoch!r}: unset it") from error
+
+
 def _created(summary: Summary) -> str:
     """Return when the work on the last shard began, or what SOURCE_DATE_EPOCH says, in UTC to the second.
 
     It does not depend on when the dataset is finished: doing that twice, even at the same time, gives the same files.
     """
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    wanted = source_date()
     try:
         started = [datetime.fromisoformat(record.started) for _, record in summary.records if record.started]
         last = max((moment.timestamp() for moment in started), default=time.time())
-        return datetime.fromtimestamp(int(epoch or last), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        moment = datetime.fromtimestamp(int(last), UTC) if wanted is None else wanted
+        return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        message = f"SOURCE_DATE_EPOCH is {epoch!r}" if epoch else "a shard's record has an unreadable start"
-        raise DatasetError(f"cannot tell when the dataset was made: {message} ({error})") from error
+        raise DatasetError(f"cannot tell when the dataset was made: a shard's record has no start ({error})") from error
 
 
 def _manifest(folder: Path, summary: Summary, *, created: str) -> dict[str, Any]:
