@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.plans import Plans, make_plans
     from cnpgen.plans.save import save_plans
     from cnpgen.refine.options import RefineOptions
+    from cnpgen.refine.proof import explain_plans
     from cnpgen.refinement import Refinement, refine_plans
     from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.reader import open_dataset
@@ -52,6 +53,7 @@ _HOME = {
     "check_machine": "doctor",
     "draw_problems": "solving",
     "evaluate_plans": "evaluation",
+    "explain_plans": "refine.proof",
     "export_plans": "export.plans",
     "fit_motion": "trajectory.fit",
     "inspect_dataset": "inspection",
@@ -91,6 +93,7 @@ __all__ = [
     "check_machine",
     "draw_problems",
     "evaluate_plans",
+    "explain_plans",
     "export_plans",
     "fit_motion",
     "inspect_dataset",

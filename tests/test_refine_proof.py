@@ -11,6 +11,7 @@ import pytest
 from example_plans import ROBOTS, Plan, load, raised
 
 from cnpgen.cli.main import main
+from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.proof import Finding, Kind, explain_failure, explain_plans
@@ -158,13 +159,15 @@ def explain_case(plan: Plan) -> Finding:
 
 
 def test_a_motion_that_starts_off_the_table_may_be_that_far_off_for_a_while() -> None:
-    on = load("hit").goal_xyz[0]
+    def above(height: float) -> np.ndarray:
+        return load("hit").goal_xyz[0] + np.array([0.0, 0.0, height])
+
     for band, start, off in ((0.005, 0.0, True), (0.005, 4e-3, False), (0.0, 4e-3, True), (0.005, 0.2, False)):
         problem = load("hit").with_constraint("Table", start_band=band).problem
-        bounds = table_bounds(problem, on + [0.0, 0.0, start], tolerances=1.0)
+        bounds = table_bounds(problem, np.add(on, [0.0, 0.0, start]), tolerances=1.0)
         assert bounds is not None
-        assert (bounds.exceedance(on + [0.0, 0.0, 4e-3])[1] > 0) == off
-        assert bounds.exceedance(on + [0.0, 0.0, 7e-3])[1] > 0
+        assert (bounds.exceedance(np.add(on, [0.0, 0.0, 4e-3]))[1] > 0) == off
+        assert bounds.exceedance(np.add(on, [0.0, 0.0, 7e-3]))[1] > 0
 
 
 def test_a_start_further_off_the_table_than_allowed_is_infeasible() -> None:
@@ -219,6 +222,15 @@ def test_a_joint_that_runs_into_its_limit_is_named() -> None:
 def test_boundary_conditions_that_are_no_numbers_are_said_to_be_none() -> None:
     plan = load("hit")
     assert "no numbers" in explain(plan, goal_q=plan.boundary.goal_q * np.nan).text
+
+
+def test_by_default_the_plans_that_are_not_valid_are_explained() -> None:
+    plans = solved("airhockey-hit", 3).select(np.arange(2))
+    doubted = replace(plans, status=np.array([1, 2], np.uint8))
+    assert list(explain_plans(plans)) == []
+    assert list(explain_plans(doubted)) == [1]
+    with pytest.raises(UsageError, match="there are plans 0 to 1, got 2"):
+        explain_plans(plans, [2])
 
 
 def test_the_commands_explain_plans_that_are_not_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

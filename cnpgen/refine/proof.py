@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.refine.ends import end_mistakes
 from cnpgen.refine.reachable import departures, joint_limits, moments
 from cnpgen.refine.table_proof import find_leaving
@@ -75,18 +76,26 @@ def explain_failure(
     return _off_table(problem, robot, boundary) or unknown
 
 
-def explain_plans(plans: "Plans", which: Sequence[int]) -> dict[int, Finding]:
-    """Explain some plans of a set.
+def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[int, Finding]:
+    """Say of some plans' problems why no valid plan was found.
 
     Args:
         plans: The plans.
-        which: Indices of those that are to be explained.
+        which: Indices of those that are to be explained; by default all whose status is not valid.
 
     Returns:
         Index -> finding.
+
+    Raises:
+        UsageError: There is no plan of such an index.
     """
     from cnpgen.plans.problem import open_problem
+    from cnpgen.plans.status import PlanStatus
 
+    if which is None:
+        which = np.flatnonzero(plans.status != PlanStatus.VALID).tolist()
+    if wrong := [index for index in which if not 0 <= index < len(plans)]:
+        raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}")
     if not len(which):
         return {}
     problem, robot = open_problem(plans.problem)

@@ -32,5 +32,5 @@ def signals_held_back() -> Iterator[Received]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        for number, frame in received[:1]:
-            before[signal.Signals(number)](number, frame)
+        for first, frame in received[:1]:
+            before[signal.Signals(first)](first, frame)
