@@ -164,10 +164,10 @@ def test_a_motion_that_starts_off_the_table_may_be_that_far_off_for_a_while() ->
 
     for band, start, off in ((0.005, 0.0, True), (0.005, 4e-3, False), (0.0, 4e-3, True), (0.005, 0.2, False)):
         problem = load("hit").with_constraint("Table", start_band=band).problem
-        bounds = table_bounds(problem, np.add(on, [0.0, 0.0, start]), tolerances=1.0)
+        bounds = table_bounds(problem, above(start), tolerances=1.0)
         assert bounds is not None
-        assert (bounds.exceedance(np.add(on, [0.0, 0.0, 4e-3]))[1] > 0) == off
-        assert bounds.exceedance(np.add(on, [0.0, 0.0, 7e-3]))[1] > 0
+        assert (bounds.exceedance(above(4e-3))[1] > 0) == off
+        assert bounds.exceedance(above(7e-3))[1] > 0
 
 
 def test_a_start_further_off_the_table_than_allowed_is_infeasible() -> None:
