@@ -609,8 +609,33 @@ BROKEN = {
     "fails": ("CC", "/bin/false", "/bin/false does not run"),
     "makes nothing": ("CC", "/bin/true", "/bin/true failed with exit code 0"),
     "does not exist": ("CC", "/nowhere/cc", "no C compiler found"),
+    "does not exist, with options": ("CC", "/nowhere/cc -O2", "no C compiler found: CC is '/nowhere/cc -O2'"),
+    "is not quoted right": ("CC", "cc '-O2", "no C compiler found: CC is"),
     "is not installed": ("PATH", "", "no C compiler found"),
 }
+
+
+@needs_compiler
+@pytest.mark.parametrize("command", ["'{cc}' -g", "{cc} -DNAME='two words'", "{cc}"])
+def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, tmp_path, command):
+    """Wrappers such as ccache are named so: CC="ccache gcc"."""
+    path = tmp_path / "my compilers" / "cc" if "'{cc}'" in command or command == "{cc}" else tmp_path / "cc"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f'#!/bin/sh\nprintf "%s|" "$@" >> "{tmp_path}/seen"\nexec {find_compiler()} "$@"\n')
+    path.chmod(0o755)
+    compiled_module.find_compiler.cache_clear()
+    monkeypatch.setenv("CC", command.format(cc=path))
+    assert chosen_with_warnings() == ("compiled", own_cache, [])
+    seen = (tmp_path / "seen").read_text()
+    assert {"'{cc}' -g": "-g|", "{cc} -DNAME='two words'": "-DNAME=two words|", "{cc}": "--version|"}[command] in seen
+    assert "-shared|" in seen
+
+
+@needs_compiler
+def test_options_of_the_compiler_are_part_of_what_a_library_is_cached_under(root, own_cache):
+    tape = tape_from_function(root, ROOT)
+    stems = {compiled_module.library_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
+    assert len(stems) == 3
 
 
 @pytest.mark.parametrize("what", BROKEN)

@@ -5,6 +5,7 @@ import hashlib
 import logging
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -80,13 +81,30 @@ def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
 
 @cache
 def find_compiler() -> str | None:
-    """Return the path of the C compiler: ``$CC``, then cc, gcc, clang; None where there is none."""
-    candidates = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    return next((path for path in map(shutil.which, candidates) if path), None)
+    """Return the command of the C compiler: ``$CC``, then cc, gcc, clang; None where there is none.
+
+    It is quoted as a shell would want it: CC may be a path with spaces, or a program with options ("ccache gcc").
+    """
+    if wanted := os.environ.get("CC"):
+        return _command([wanted]) or _command(_words(wanted))
+    return next((path for path in map(shutil.which, ["cc", "gcc", "clang"]) if path), None)
+
+
+def _words(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError:  # a quotation mark is not closed
+        return []
+
+
+def _command(words: list[str]) -> str | None:
+    """Return a command with the path of its program, or None if there is no such program."""
+    path = shutil.which(words[0]) if words else None
+    return shlex.join([path, *words[1:]]) if path else None
 
 
 def require_compiler() -> str:
-    """Return the path of the C compiler.
+    """Return the command of the C compiler.
 
     Raises:
         MachineError: There is none.
@@ -94,7 +112,7 @@ def require_compiler() -> str:
     if compiler := find_compiler():
         return compiler
     if wanted := os.environ.get("CC"):
-        raise MachineError(f"no C compiler found: CC is {wanted!r}, which is no program here (set or unset it)")
+        raise MachineError(f"no C compiler found: CC is {wanted!r}, which names no program here (set or unset it)")
     raise MachineError("no C compiler found (looked for cc, gcc, clang): install gcc or clang")
 
 
@@ -106,7 +124,9 @@ def compiler_version(compiler: str) -> str:
         MachineError: The compiler does not run.
     """
     try:
-        done = subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=30, check=True)
+        done = subprocess.run(
+            [*shlex.split(compiler), "--version"], capture_output=True, text=True, timeout=30, check=True
+        )
     except (OSError, subprocess.SubprocessError) as error:
         raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
     return done.stdout.splitlines()[0].strip() if done.stdout else "unknown"
@@ -143,7 +163,8 @@ def _emitter_digest() -> str:
 def library_stem(tape: Tape, compiler: str) -> str:
     """How the file name of a tape's library begins: with everything that determines its content."""
     identity = hashlib.sha256(tape.to_bytes())
-    for text in (*FLAGS, optimisation(tape), *vector_flags(), compiler_version(compiler), target(), _emitter_digest()):
+    flags = (*FLAGS, optimisation(tape), *vector_flags(), *shlex.split(compiler)[1:])
+    for text in (*flags, compiler_version(compiler), target(), _emitter_digest()):
         identity.update(text.encode() + b"\0")
     return f"{tape.name}-{identity.hexdigest()[:24]}"
 
@@ -193,7 +214,7 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
 
 
 def _run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
-    command = [compiler, *FLAGS, level, *vector_flags(), str(source), "-o", str(built), "-lm"]
+    command = [*shlex.split(compiler), *FLAGS, level, *vector_flags(), str(source), "-o", str(built), "-lm"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
