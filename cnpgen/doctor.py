@@ -79,7 +79,7 @@ class MachineReport:
         cache_folder: Where kernels are cached.
         cache_writable: Whether they can be.
         recipes: How many recipes were found where.
-        free_bytes: Free disk space in the working directory.
+        free_bytes: Free disk space in the working directory; 0 where it is gone.
         problems: What keeps cnpgen from working, each with its remedy.
         notes: What makes it slower, or is worth knowing.
     """
@@ -281,7 +281,11 @@ def _check_recipes(found: _Findings) -> str:
 
 
 def _check_disk(found: _Findings) -> int:
-    free = shutil.disk_usage(Path.cwd()).free
+    try:
+        free = shutil.disk_usage(Path.cwd()).free
+    except OSError as error:
+        found.notes.append(f"the working directory cannot be looked at ({error.strerror}): go to another one")
+        return 0
     if free < ENOUGH_DISK:
         found.notes.append(
             f"only {free / 1e6:,.0f} MB are free in {Path.cwd()}: choose another --out for large datasets"

@@ -92,6 +92,16 @@ def test_a_broken_library_is_one_line_with_a_remedy(monkeypatch, error):
     assert "--force-reinstall coal" in report.problems[0]
 
 
+def test_a_working_directory_that_is_gone_is_a_note(monkeypatch, tmp_path):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    report = check_machine()
+    assert report.ok
+    assert report.free_bytes == 0
+    assert any(note.startswith("the working directory cannot be looked at (No such file") for note in report.notes)
+
+
 def test_a_missing_plotting_library_is_only_a_note(monkeypatch):
     _import_failing(monkeypatch, "matplotlib", ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib"))
     report = check_machine()
