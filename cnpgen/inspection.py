@@ -11,9 +11,9 @@ from cnpgen.fields import Field
 from cnpgen.outcome import Outcome, densities_to_json
 from cnpgen.store.check import check_documents
 from cnpgen.store.documents import plain
-from cnpgen.store.layout import MANIFEST, PLAN
+from cnpgen.store.layout import DOCUMENTS, MANIFEST, PLAN
 from cnpgen.store.places import require_folder
-from cnpgen.store.plan import DatasetPlan, load_plan
+from cnpgen.store.plan import DatasetPlan, load_plan, shards
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise, unfinished
 from cnpgen.store.workspace import is_dataset
@@ -154,7 +154,12 @@ def inspect_dataset(folder: str | Path) -> Inspection:
     except DatasetError as error:
         raise DatasetError(f"{error}; 'cnpgen validate' says what to do") from error
     summary = summarise(folder, plan, allow_partial=True)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     sealed = (folder / MANIFEST).is_file()
     damage = tuple(str(finding) for finding in check_documents(folder, plan)) if sealed else ()
-    return Inspection(folder, summary, sealed, size, damage)
+    return Inspection(folder, summary, sealed, _size(folder, plan), damage)
+
+
+def _size(folder: Path, plan: DatasetPlan) -> int:
+    """Add up the files of a dataset, without what else is in its folder [bytes]."""
+    names = [*DOCUMENTS, *(name for task in shards(plan) for name in (task.file, task.sidecar))]
+    return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())

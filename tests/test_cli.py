@@ -302,9 +302,19 @@ def test_a_dry_run_says_what_is_in_the_folder(run, hits, tmp_path):
     (tmp_path / "half" / "manifest.json").unlink()
     assert "complete already" in run(*MAKE, hits, "--dry-run")[1]
     assert "another dataset: would be refused" in run(*MAKE, hits, "--dry-run", "--seed", "5")[1]
-    assert "would be replaced" in run(*MAKE, hits, "--dry-run", "--force")[1]
+    assert "holds a dataset, which would be replaced" in run(*MAKE, hits, "--dry-run", "--force")[1]
     assert "1 of 2 shards are there: would go on" in run(*MAKE, tmp_path / "half", "--dry-run")[1]
     assert "something else: would be refused" in run(*MAKE, tmp_path, "--dry-run")[1]
+
+
+def test_a_dry_run_with_force_says_that_foreign_files_would_be_in_the_way(run, hits, tmp_path):
+    folder = Path(shutil.copytree(hits, tmp_path / "hits"))
+    (folder / "train" / "thesis.tex").write_text("mine")
+    code, out, _ = run(*MAKE, folder, "--dry-run", "--force")
+    assert code == 0
+    refusal = "would be refused: it holds train/thesis.tex, which is not part of the dataset: move it away first"
+    assert refusal in " ".join(out.split())
+    assert run(*MAKE, folder, "--force")[0] == 2
 
 
 def test_a_dry_run_says_what_becomes_of_a_plan_that_is_damaged_or_of_which_nothing_was_made(run, hits, tmp_path):
@@ -368,7 +378,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_sees_a_bar_with_the_share_of_accepted_draws(monkeypatch):
+def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("COLUMNS", "120")
@@ -380,7 +390,8 @@ def test_a_terminal_sees_a_bar_with_the_share_of_accepted_draws(monkeypatch):
     meter.close()
     assert "100/300" in terminal.getvalue()
     assert "300/300" in terminal.getvalue()
-    assert "66.7% of draws accepted" in terminal.getvalue()
+    assert "300 draws tried, 66.7% accepted" in terminal.getvalue()
+    assert "row/s" in terminal.getvalue()
     assert meter.rows == 200
     assert meter.outcome.tried == 300
 

@@ -42,6 +42,15 @@ def test_rows_and_state_of_a_complete_dataset(hits):
     assert found.seconds > 0
 
 
+def test_what_is_not_part_of_a_dataset_is_not_counted_in_its_size(hits, tmp_path):
+    folder = tmp_path / "hits"
+    shutil.copytree(hits, folder)
+    for name in ("movie.mp4", "train/notes.txt", "_work/.shard-00000.h5.tmp"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(bytes(1000))
+    assert inspect_dataset(folder).bytes == inspect_dataset(hits).bytes
+
+
 def test_statistics_are_those_of_the_rows(hits):
     found, dataset = inspect_dataset(hits), open_dataset(hits)
     rows = np.concatenate([dataset.read(split)["goal_q"] for split in ("train", "validation")])

@@ -11,7 +11,7 @@ from cnpgen.store.layout import MANIFEST
 from cnpgen.store.plan import DatasetPlan, shards
 from cnpgen.store.record import pending
 from cnpgen.store.shard import storage_dtype
-from cnpgen.store.workspace import holds_plan, is_dataset
+from cnpgen.store.workspace import check_clearable, holds_plan, is_dataset
 
 if TYPE_CHECKING:
     from cnpgen.recipes import DatasetRecipe
@@ -72,8 +72,17 @@ def folder_state(folder: Path, plan: DatasetPlan, *, force: bool) -> str:
     if not is_dataset(folder):
         return "holds something else: would be refused"
     if force:
-        return "holds a dataset, which would be replaced"
+        return _replacement(folder)
     return _refusal(folder, plan) or _progress(folder, plan)
+
+
+def _replacement(folder: Path) -> str:
+    """Say whether --force would replace the dataset in a folder."""
+    try:
+        check_clearable(folder)
+    except UsageError as error:
+        return f"would be refused: it {str(error).removeprefix(f'{folder} ')}"
+    return "holds a dataset, which would be replaced"
 
 
 def _refusal(folder: Path, plan: DatasetPlan) -> str:

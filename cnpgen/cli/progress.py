@@ -73,8 +73,9 @@ class Meter:
             self.outcome = outcome if self.outcome is None else self.outcome.merge(outcome)
         if self._bar is not None:
             if self.outcome is not None:
+                tried = self._bar.format_sizeof(self.outcome.tried)
                 share = self.outcome.accepted / max(self.outcome.tried, 1)
-                self._bar.set_postfix_str(f"{share:.1%} of draws accepted", refresh=False)
+                self._bar.set_postfix_str(f"{tried} draws tried, {share:.1%} accepted", refresh=False)
             self._bar.update(rows)
 
     def note(self, text: str) -> None:

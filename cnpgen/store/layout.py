@@ -21,6 +21,9 @@ CARD = "README.md"
 CROISSANT = "croissant.json"
 WORK = "_work"
 
+DOCUMENTS = (PLAN, MANIFEST, STATS, CARD, CROISSANT)
+"""The files of a dataset that are not of one shard."""
+
 SPLIT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 """Names that are folders everywhere and splits to Hugging Face."""
 

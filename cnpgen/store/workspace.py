@@ -153,14 +153,7 @@ def clear_dataset(folder: Path) -> None:
     """
     if not folder.is_dir() or not any(folder.iterdir()):
         return
-    if not is_dataset(folder):
-        raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
-    splits = _splits(folder)
-    foreign = _foreign(folder, splits)
-    if foreign:
-        raise UsageError(
-            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
-        )
+    splits = check_clearable(folder)
     try:
         (folder / MANIFEST).unlink(missing_ok=True)  # first: what is half deleted must not look complete
         for split in splits:
@@ -172,6 +165,23 @@ def clear_dataset(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error
+
+
+def check_clearable(folder: Path) -> list[Path]:
+    """Refuse a folder that holds anything else than a dataset; return the folders of its splits.
+
+    Raises:
+        UsageError: It does.
+    """
+    if not is_dataset(folder):
+        raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
+    splits = _splits(folder)
+    foreign = _foreign(folder, splits)
+    if foreign:
+        raise UsageError(
+            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
+        )
+    return splits
 
 
 def _splits(folder: Path) -> list[Path]:
