@@ -219,10 +219,11 @@ def resolved(recipe: Problem | Pipeline | DatasetRecipe) -> dict[str, Any]:
 
 
 def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
-    """Hash all that decides which rows a seed gives, and nothing else.
+    """Hash all that decides which rows a seed gives.
 
     That is the resolved pipeline and problem, the code of plug-ins and the content of the URDF: not titles, comments,
-    paths, the seed or the splits. Writing "5 mm" for 0.005 or a default explicitly does not change it.
+    paths, the seed or the splits. Writing "5 mm" for 0.005 or a default explicitly does not change it; another name, or
+    what is read only where motions are planned (trajectory, objective), does, although the rows stay the same.
 
     Returns:
         sha256, as 64 hexadecimal digits.

@@ -43,7 +43,12 @@ def add(commands: "Commands[Parser]") -> None:
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
-    option("--shard-size", metavar="R", type=values.positive, help="rows per file (default: 8192 to 65536)")
+    option(
+        "--shard-size",
+        metavar="R",
+        type=values.positive,
+        help="rows per file; default 8192 to 65536, with --certify 512 to 1024",
+    )
     option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
     option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")
     option(
