@@ -63,19 +63,31 @@ class Slowing:
         return np.concatenate([np.empty(0), *(self._block(motion[part], tops[part]) for part in parts)])
 
     def _block(self, motion: Motion, tops: Array) -> Array:
-        p, p1, p2 = (_lanes(table @ motion.path) for table in self.path)
-        r, r1 = ((motion.rate @ table.T).reshape(1, -1) for table in self.rate)
-        dq, ddq = p1 * r, (p2 * r + p1 * r1) * r
-        heights = np.repeat(tops.T, self.path.shape[1], axis=1)
-        fast, slow, rest = (self.residuals(p, dq / k, ddq / k**2, heights)[0] for k in (1.0, 2.0, np.inf))
+        (fast,) = self.residuals(*self._states(motion, tops, 1.0))
+        over = ((fast > self.upper[:, None]) | (fast < self.lower[:, None])).any(axis=0)
+        slower = over.reshape(len(motion), -1).any(axis=1)
+        factor = np.ones(len(motion))
+        if slower.any():  # most motions are slow enough, and one look tells
+            factor[slower] = self._needed(motion[slower], tops[slower])
+        return factor
+
+    def _needed(self, motion: Motion, tops: Array) -> Array:
+        """Smallest factors of motions that exceed a limit somewhere."""
+        fast, slow, rest = (self.residuals(*self._states(motion, tops, k))[0] for k in (1.0, 2.0, np.inf))
         quadratic = 2 * (fast - 2 * slow + rest)  # c, from g(1) = rest + b + c and g(2) = rest + b / 2 + c / 4
         linear = fast - rest - quadratic
         needed = np.maximum(
             _smallest(self.upper[:, None] - rest, linear, quadratic),
             _smallest(rest - self.lower[:, None], -linear, -quadratic),
         )
-        factor: Array = needed.max(axis=0, initial=1.0).reshape(len(motion), self.path.shape[1]).max(axis=1)
+        factor: Array = needed.max(axis=0, initial=1.0).reshape(len(motion), -1).max(axis=1)
         return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
+
+    def _states(self, motion: Motion, tops: Array, k: float) -> tuple[Array, Array, Array, Array]:
+        """Positions, velocities, accelerations and obstacles at all phases of motions k times as slow, samples last."""
+        p, p1, p2 = (_lanes(table @ motion.path) for table in self.path)
+        r, r1 = ((motion.rate @ table.T).reshape(1, -1) for table in self.rate)
+        return p, p1 * r / k, (p2 * r + p1 * r1) * r / k**2, np.repeat(tops.T, self.path.shape[1], axis=1)
 
 
 def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Slowing:
