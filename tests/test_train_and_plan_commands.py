@@ -139,6 +139,25 @@ def test_refined_plans_are_those_of_the_refine_command(trained, tiny, tmp_path, 
     assert not (tmp_path / "p.h5.part").exists()
 
 
+def test_refining_goes_on_where_it_was_interrupted(trained, tiny, tmp_path, capsys, monkeypatch):
+    words = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(tmp_path / "p.h5"), "--n", "4"]
+    seen = []
+
+    def interrupted(_meter, plans: int) -> None:
+        seen.append(plans)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cnpgen.cli.progress.Meter.__call__", interrupted)
+        code, text = failing(capsys, [*words, "--refine", "--workers", "1"])
+    assert code == 130
+    assert "p.h5.part keeps what is finished, run the same command again to go on" in text
+    assert main([*words, "--refine", "--workers", "1"]) == 0
+    assert "4 plans, 2 there already" in capsys.readouterr().err
+    assert len(load_plans(tmp_path / "p.h5")) == 4
+
+
 @pytest.mark.parametrize("words", [["--workers", "2"], ["--objective", "jerk"], ["--step", "2ms"]])
 def test_options_of_refining_are_not_ignored_without_it(trained, tiny, tmp_path, capsys, words):
     plan = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(tmp_path / "p.h5"), *words]
