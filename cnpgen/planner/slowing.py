@@ -65,7 +65,7 @@ class Slowing:
     def _block(self, motion: Motion, tops: Array) -> Array:
         (fast,) = self.residuals(*self._states(motion, tops, 1.0))
         over = ((fast > self.upper[:, None]) | (fast < self.lower[:, None])).any(axis=0)
-        slower = over.reshape(len(motion), -1).any(axis=1)
+        slower: NDArray[np.bool_] = np.asarray(over.reshape(len(motion), -1).any(axis=1))
         factor = np.ones(len(motion))
         if slower.any():  # most motions are slow enough, and one look tells
             factor[slower] = self._needed(motion[slower], tops[slower])
@@ -85,8 +85,8 @@ class Slowing:
 
     def _states(self, motion: Motion, tops: Array, k: float) -> tuple[Array, Array, Array, Array]:
         """Positions, velocities, accelerations and obstacles at all phases of motions k times as slow, samples last."""
-        p, p1, p2 = (_lanes(table @ motion.path) for table in self.path)
-        r, r1 = ((motion.rate @ table.T).reshape(1, -1) for table in self.rate)
+        p, p1, p2 = _lanes(self.path, motion.path)
+        r, r1 = _lanes(self.rate, motion.rate[..., None])
         return p, p1 * r / k, (p2 * r + p1 * r1) * r / k**2, np.repeat(tops.T, self.path.shape[1], axis=1)
 
 
@@ -104,9 +104,11 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
     return Slowing(kernels.load(speed_residuals), *speed_bounds(robot, problem), path, rate)
 
 
-def _lanes(values: Array) -> Array:
-    """Turn (N, K, n) into (n, N K)."""
-    return np.ascontiguousarray(values.reshape(-1, values.shape[-1]).T)
+def _lanes(tables: Array, points: Array) -> Array:
+    """Evaluate N splines: from (m, K, C) and (N, C, n) to (m, n, N K)."""
+    count, phases, basis_functions = tables.shape
+    values = (tables.reshape(-1, basis_functions) @ points).reshape(len(points), count, phases, -1)
+    return np.ascontiguousarray(values.transpose(1, 3, 0, 2)).reshape(count, points.shape[2], -1)
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:
