@@ -260,10 +260,16 @@ WRONG = [
     ("heavy-object", add("start_q", 17, 1e-5, 5), "tilt"),
     ("heavy-object", add("start_xyz", 17, 0.03, 2), "robot clearance"),
     ("heavy-object", add("goal_xyz", 17, 0.008, 2), "object contact"),
+    ("heavy-object", add("start_torque_ratio", 17, -1e-7), "holding torque ratio"),
+    ("heavy-object", add("goal_torque_ratio", 17, -1e-7), "holding torque ratio"),
+    ("heavy-object", add("start_clearance", 17, 1e-7), "clearance"),
+    ("heavy-object", add("goal_clearance", 17, -1e-7), "clearance"),
 ]
 
 
-@pytest.mark.parametrize(("name", "change", "check"), WRONG, ids=[f"{name} {check}" for name, _, check in WRONG])
+@pytest.mark.parametrize(
+    ("name", "change", "check"), WRONG, ids=[f"{index} {check}" for index, (_, _, check) in enumerate(WRONG)]
+)
 def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(tiny: Tiny, tmp_path, name, change, check):
     folder = copied(tiny, tmp_path, name)
     edit(folder, "train/shard-00001.h5", change)

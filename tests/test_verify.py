@@ -10,7 +10,9 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.optimize import minimize_scalar
 
+from cnpgen.constraints.clearance import RobotClearance
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.library import load_problem
@@ -176,6 +178,74 @@ def test_right_carries_pass(carries):
     report = verify_rows(HEAVY, carries.robot, carries.columns)
     assert failures(report) == set()
     assert {"tilt", "upright", "robot clearance", "object contact"} <= {check.name for check in report.checks}
+
+
+def distance_of_arm(robot: Robot, q: np.ndarray, boxes: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """How far the arm's segments are from boxes, a convex problem each, by SciPy."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    corners = [*(data.oMi[i].translation.copy() for i in (2, 4, 6)), tip_pose(robot, q).translation.copy()]
+
+    def nearest(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+        def distance(s: float) -> float:
+            point = a + s * (b - a)
+            return float(np.linalg.norm(point - np.clip(point, low, high)))
+
+        return float(minimize_scalar(distance, bounds=(0, 1), method="bounded", options={"xatol": 1e-10}).fun)
+
+    return min(nearest(a, b, low, high) for a, b in pairwise(corners) for low, high in boxes)
+
+
+@pytest.fixture(scope="module")
+def diagnosed(carries) -> Case:
+    """Carries with the diagnostics of their ends, by Pinocchio's gravity term and SciPy."""
+    columns, robot = carries.copy(), carries.robot
+    radius = next(each.radius for each in HEAVY.constraint if isinstance(each, RobotClearance))
+    for end in ("start", "goal"):
+        columns[f"{end}_torque_ratio"], columns[f"{end}_clearance"] = np.empty(ROWS), np.empty(ROWS)
+    for row in range(ROWS):
+        tops = obstacle_tops(HEAVY, columns["start_xyz"][row], columns["goal_xyz"][row])
+        boxes = [
+            (np.array([box.x.low, box.y.low, -9.0]), np.array([box.x.high, box.y.high, top]))
+            for box, top in zip(HEAVY.obstacle, tops, strict=True)
+        ]
+        for end in ("start", "goal"):
+            q = columns[f"{end}_q"][row]
+            torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+            columns[f"{end}_torque_ratio"][row] = np.max(np.abs(torque) / robot.torque_limit)
+            columns[f"{end}_clearance"][row] = distance_of_arm(robot, q, boxes) - radius
+    return Case(robot, columns)
+
+
+def test_right_diagnostics_pass(diagnosed):
+    report = verify_rows(HEAVY, diagnosed.robot, diagnosed.columns)
+    assert report.ok
+    assert {"holding torque ratio", "clearance"} <= {check.name for check in report.checks}
+
+
+@pytest.mark.parametrize("end", ["start", "goal"])
+@pytest.mark.parametrize(
+    ("field", "check"), [("torque_ratio", "holding torque ratio"), ("clearance", "clearance")], ids=["torque", "arm"]
+)
+def test_a_wrong_diagnostic_is_found_in_its_row_and_end(diagnosed, end, field, check):
+    columns = diagnosed.copy()
+    columns[f"{end}_{field}"][4] += 1e-7
+    report = verify_rows(HEAVY, diagnosed.robot, columns)
+    (failed,) = report.failed
+    assert (failed.name, failed.rows_out, failed.worst_row, failed.worst_end) == (check, 1, 4, end)
+    assert failed.worst == pytest.approx(1e-7, rel=0.1)
+    assert report.out.tolist() == [4]
+
+
+def test_the_diagnostics_of_one_end_alone_are_checked(diagnosed):
+    columns = diagnosed.copy()
+    del columns["start_clearance"], columns["start_torque_ratio"], columns["goal_torque_ratio"]
+    columns["goal_clearance"][2] = np.nan  # fails as such, and is not compared
+    report = verify_rows(HEAVY, diagnosed.robot, columns)
+    assert failures(report) == {"finite"}
+    assert "holding torque ratio" not in {check.name for check in report.checks}
+    columns["goal_clearance"][3] += 1.0
+    assert failures(verify_rows(HEAVY, diagnosed.robot, columns)) == {"finite", "clearance"}
 
 
 def test_right_rows_stored_in_single_precision_pass_as_such_only(hits):

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 
 _TEXT = """\
 Always checked: that every file is there, whole (sha256) and what the plan and the manifest say. --deep reads every row:
-constraints, positions, hits, stored ranges, statistics, counts, and rows that stand there twice. --regenerate draws and
-solves blocks of 4096 rows again from the seed: with the backend, the kind of machine and the versions that made the
+constraints, positions, hits, torque ratios and clearances, stored ranges, statistics, counts, and rows that stand there
+twice. Of hit_speed_max it checks only that hit_speed is not above, of attempts only their sum in each shard: these
+numbers, the other columns of plug-ins, and which draws became rows are for --regenerate to prove. It draws and solves blocks of 4096 rows again from the seed: with the backend, the kind of machine and the versions that made the
 dataset every bit is the same; elsewhere rows that agree to rounding (1e-9) are no finding.
 
 On stdout are the findings, one per line, as FILE: PROBLEM, and what was checked; with --quiet the findings only. A line

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from cnpgen.constraints.constraint import EXACTNESS, Condition
 from cnpgen.errors import DatasetError
 from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.verify.diagnostics import Diagnostic, stored_diagnostics
 from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
 from cnpgen.verify.world import World
 
@@ -40,7 +41,9 @@ def verify_rows(
       accelerations is skipped at an end whose accelerations are not stored, unless the row rests there: a robot that
       stands still has ddq = 0, so its static torque is checked;
     * "hit direction", where ``hit_speed`` is positive, and "hit speed", along the hit: of the tip at the goal, if the
-      rows have ``hit_angle`` and ``hit_speed``.
+      rows have ``hit_angle`` and ``hit_speed``;
+    * "holding torque ratio" and "clearance": what the rows store of an end as ``start_torque_ratio``,
+      ``goal_torque_ratio``, ``start_clearance`` and ``goal_clearance`` is what is computed there.
 
     How exactly each must hold is ``cnpgen.constraints.constraint.EXACTNESS``.
 
@@ -48,8 +51,8 @@ def verify_rows(
         problem: The problem.
         robot: Its robot.
         columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
-            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``.
-            Other fields must be finite.
+            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``
+            and diagnostics. Other fields must be finite.
         dtype: The float type that the rows are stored in, which decides how exact they must be.
 
     Raises:
@@ -105,11 +108,13 @@ class _Block:
     Attributes:
         position: Tip positions [m], shape (rows, 2, 3); nan where nothing was measured.
         hit_velocity: Tip velocities at the goal [m/s], shape (rows, 3); likewise.
+        diagnostics: Those that the rows store.
         conditions: The constraints' conditions, in order of first use.
     """
 
     position: Array
     hit_velocity: Array
+    diagnostics: list[Diagnostic]
     conditions: dict[Key, _Values] = field(default_factory=dict)
 
 
@@ -126,6 +131,7 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
         _judge_position(block, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in block.conditions.items()),
         *_judge_hit(block, columns, finite, dtype),
+        *(diagnostic.judged(finite, dtype) for diagnostic in block.diagnostics),
     ]
     out = np.unique(np.concatenate([rows_out for _, rows_out in judged]))
     return RowReport(rows, tuple(check for check, _ in judged), out)
@@ -135,7 +141,7 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     """Move the world to both ends of every finite row and note what it measures there."""
     rows = len(columns["start_q"])
     tops = obstacle_tops(problem, columns["start_xyz"], columns["goal_xyz"])
-    block = _Block(np.full((rows, 2, 3), np.nan), np.full((rows, 3), np.nan))
+    block = _Block(np.full((rows, 2, 3), np.nan), np.full((rows, 3), np.nan), stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):
         (q, dq, ddq), orders = _states(columns, end)
         for row in finite.tolist():
@@ -143,6 +149,8 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
             block.position[row, index] = world.tip_position
             found = chain.from_iterable(c.measured_at(world, end) for c in problem.constraint)
             _note(block, found, orders[row], (row, index))
+            for diagnostic in block.diagnostics:
+                diagnostic.note(world, row, index)
             if end == "goal" and "hit_speed" in columns:
                 block.hit_velocity[row] = world.tip_velocity
     return block

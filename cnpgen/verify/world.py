@@ -60,6 +60,7 @@ class World:
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
         self._scene.set_tops(tops.tolist())
+        self._distances: list[float] | None = None
 
     @property
     def torque(self) -> Array:
@@ -67,6 +68,13 @@ class World:
         import pinocchio as pin
 
         return np.array(pin.rnea(self._model, self._dynamics_data, self.q, self.dq, self.ddq))
+
+    @property
+    def holding_torque(self) -> Array:
+        """Torque that holds the arm still at ``q`` [N m], shape (n,)."""
+        import pinocchio as pin
+
+        return np.array(pin.computeGeneralizedGravity(self._model, self._dynamics_data, self.q))
 
     @property
     def tip_position(self) -> Array:
@@ -96,10 +104,12 @@ class World:
 
     def segment_distances(self) -> list[float]:
         """Measure how far every segment of the robot's skeleton is from every obstacle, segment by segment [m]."""
-        poses = self._data.oMi  # of the universe and joints 1 to n
-        points = {joint: poses[joint + 1].translation.tolist() for joint in self._joints}
-        points[self.robot.n] = self._T_world_tip.translation.tolist()
-        return self._scene.segment_distances([(points[a], points[b]) for a, b in self._skeleton])
+        if self._distances is None:
+            poses = self._data.oMi  # of the universe and joints 1 to n
+            points = {joint: poses[joint + 1].translation.tolist() for joint in self._joints}
+            points[self.robot.n] = self._T_world_tip.translation.tolist()
+            self._distances = self._scene.segment_distances([(points[a], points[b]) for a, b in self._skeleton])
+        return self._distances
 
     def object_distances(self) -> list[float]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
