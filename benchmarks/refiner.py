@@ -35,6 +35,7 @@ from cnpgen.refine.proof import explain_plans
 from cnpgen.refine.refiner import Passes, Refiner
 from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems
+from cnpgen.threads import one_thread
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verify.world import World
 
@@ -249,7 +250,8 @@ def main() -> None:
     tables: list[str] = []
     for name in options.parts:
         progress(name)
-        facts, found = PARTS[name](sizes, options)
+        with one_thread():
+            facts, found = PARTS[name](sizes, options)
         results |= facts
         tables += found
     report(results, tables, as_json=options.json)

@@ -74,8 +74,9 @@ def minimise_slsqp(refiner: Refiner, task: Task, x: Array, *, cap: float) -> tup
     from scipy.optimize import minimize
 
     which, start = refiner.passes.first, time.process_time()
-    bounds = refiner._bounds[which].of(task.start_xyz)
-    function = Function(refiner.transcription(task, which), bounds, start + cap)
+    motion = refiner.transcription(task, which)
+    bounds = refiner._bounds[which].of(task.start_xyz, ends=motion.end_residuals())
+    function = Function(motion, bounds, start + cap)
     try:
         with np.errstate(all="ignore"):
             found = minimize(
