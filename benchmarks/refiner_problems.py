@@ -87,7 +87,11 @@ def _make(tool: Refiner, jury: WatchedJury, task: Task) -> Made:
 
 
 def grid_of_hits() -> Plans:
-    """The 81 hits from rest in the base configuration, at the highest speed along the line to the goal."""
+    """The 81 hits from rest in the base configuration.
+
+    The mallet meets the puck ``BEHIND`` its centre on the line to the goal, at the highest speed along that line; all
+    these places are on the table.
+    """
     pipeline = load_pipeline("airhockey-hit")
     backend, cache_folder = choose_backend(None)
     context = PreparedPipeline(pipeline, backend=backend, cache_folder=cache_folder).context
