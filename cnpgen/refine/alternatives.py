@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 PATIENCE = 6  # these solvers take smaller steps: they may take this many times as many
 ROUNDS = 6
 COARSE = 32  # phases of the coarser grid
+PROXIMAL = 0.1  # weight of sqpmethod's proximal term: it has no trust region
 NEAR = 0.03  # peaks this close to their bounds are held
 FAR = 1.0  # what is further from its bounds is not held on the coarser grid either: obstacles 0.1 m away
 QUIET = 8  # iterates among which the objective hardly changes end a run
@@ -167,7 +168,7 @@ def _options(solver: str, programme: Programme, settings: Settings, limit: int, 
         return {**quiet, "ipopt": ipopt, "hess_lag": programme.hessian()}
     return {
         **quiet,
-        "hess_lag": programme.hessian(proximal=settings.proximal),
+        "hess_lag": programme.hessian(proximal=PROXIMAL),
         "qpsol": "daqp",
         "qpsol_options": {"error_on_fail": False, "print_time": False},
         "max_iter": limit,

@@ -42,7 +42,7 @@ class Settings:
 
     max_iterations: int = 40
     radius: float = 0.3
-    proximal: float = 0.1
+    proximal: float = 0.02
     penalty: float = 2.0
     cost_tolerance: float = 2e-4
     violation_tolerance: float = 6e-4
@@ -57,7 +57,7 @@ class Result:
     """Where the iteration ended.
 
     Attributes:
-        x: The best variables: smallest violation, then smallest cost.
+        x: The last iterate that was accepted: the best one by the merit function.
         cost: Objective there.
         violation: Worst scaled violation there.
         iterations: Steps tried.
@@ -100,7 +100,7 @@ class _Descent:
         at = motion.evaluate(x)
         self._at: Evaluation | None = at
         self.x, self.cost, self.violation = x, at.cost, bounds.violation(at.g)
-        self.ended = False
+        self.ended = not np.isfinite(self.violation)
         self._violations = [self.violation]
         self._motion, self._bounds, self._settings = motion, bounds, settings
         self._scale = np.ones(motion.nx)
