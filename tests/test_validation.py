@@ -257,6 +257,7 @@ WRONG = [
     ("airhockey-replan", add("hit_angle", 17, 1e-5), "hit direction"),
     ("airhockey-replan", add("hit_speed", 17, 1e-6), "hit speed"),
     ("airhockey-hit", add("goal_q", 17, 7.0, 5), "joint position"),
+    ("airhockey-replan", add("hit_speed_max", 17, 1e-7), "highest hit speed"),
     ("heavy-object", add("start_q", 17, 1e-5, 5), "tilt"),
     ("heavy-object", add("start_xyz", 17, 0.03, 2), "robot clearance"),
     ("heavy-object", add("goal_xyz", 17, 0.008, 2), "object contact"),

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.optimize import minimize_scalar
+from scipy.optimize import linprog, minimize_scalar
 
 from cnpgen.constraints.clearance import RobotClearance
 from cnpgen.constraints.constraint import Condition, Constraint
@@ -19,6 +19,7 @@ from cnpgen.library import load_problem
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.verify import rows as rows_module
+from cnpgen.verify.fastest_hit import highest_speed
 from cnpgen.verify.report import Check, RowReport, merge
 from cnpgen.verify.rows import verify_rows
 from cnpgen.verify.scene import Scene
@@ -178,6 +179,38 @@ def test_right_carries_pass(carries):
     report = verify_rows(HEAVY, carries.robot, carries.columns)
     assert failures(report) == set()
     assert {"tilt", "upright", "robot clearance", "object contact"} <= {check.name for check in report.checks}
+
+
+def test_the_highest_speed_of_a_hit_is_highs_s(hits):
+    """Random arms, too, some of whose joints do nothing, or the same."""
+    random = np.random.default_rng(3)
+    robot, angles = hits.robot, hits.columns["hit_angle"]
+    for jacobians, limit in (
+        (np.array([jacobian(robot, q)[:3] for q in hits.columns["goal_q"]]), robot.velocity_limit),
+        (random.normal(size=(ROWS, 3, 4)), random.uniform(0.5, 2.0, 4)),
+        (random.integers(-1, 2, (ROWS, 3, 7)).astype(float), np.ones(7)),
+    ):
+        found = highest_speed(jacobians, angles, limit)
+        for J, angle, speed in zip(jacobians, angles, found, strict=True):
+            along, across = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
+            equations = np.array([across @ J, J[2]])
+            solved = linprog(-along @ J, A_eq=equations, b_eq=[0, 0], bounds=[(-bound, bound) for bound in limit])
+            assert speed == pytest.approx(-solved.fun, abs=1e-9)
+
+
+def test_a_wrong_highest_speed_is_found(hits):
+    columns = hits.copy()
+    J = np.array([jacobian(hits.robot, q)[:3] for q in columns["goal_q"]])
+    columns["hit_speed_max"] = highest_speed(J, columns["hit_angle"], hits.robot.velocity_limit)
+    assert verify_rows(AIRHOCKEY, hits.robot, columns).ok
+    columns["hit_speed_max"][2] += 1e-7
+    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    assert [(check.name, check.worst_row) for check in report.failed] == [("highest hit speed", 2)]
+
+
+def test_a_hit_of_an_arm_that_cannot_keep_to_a_line_has_no_highest_speed():
+    flat = np.concatenate([np.random.default_rng(0).normal(size=(1, 2, 4)), np.zeros((1, 1, 4))], axis=1)
+    assert highest_speed(flat, np.zeros(1), np.ones(4)).tolist() == [np.inf]
 
 
 def distance_of_arm(robot: Robot, q: np.ndarray, boxes: list[tuple[np.ndarray, np.ndarray]]) -> float:

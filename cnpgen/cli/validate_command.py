@@ -13,10 +13,11 @@ if TYPE_CHECKING:
 
 _TEXT = """\
 Always checked: that every file is there, whole (sha256) and what the plan and the manifest say. --deep reads every row:
-constraints, positions, hits, torque ratios and clearances, stored ranges, statistics, counts, and rows that stand there
-twice. Of hit_speed_max it checks only that hit_speed is not above, of attempts only their sum in each shard: these
-numbers, the other columns of plug-ins, and which draws became rows are for --regenerate to prove. It draws and solves blocks of 4096 rows again from the seed: with the backend, the kind of machine and the versions that made the
-dataset every bit is the same; elsewhere rows that agree to rounding (1e-9) are no finding.
+constraints, positions, hits and their highest speeds, torque ratios, clearances, stored ranges, statistics, counts, and
+rows that stand there twice; of "attempts" only the sum per shard. Every row's attempts, the columns of plug-ins, and
+which draws became rows are for --regenerate to prove. It draws and solves blocks of 4096 rows again from the seed: with
+the backend, the kind of machine and the versions that made the dataset every bit is the same; elsewhere rows that agree
+to rounding (1e-9) are no finding.
 
 On stdout are the findings, one per line, as FILE: PROBLEM, and what was checked; with --quiet the findings only. A line
 that begins with "note:" is worth knowing and no finding. Of a certified dataset --deep judges the plans, too, as

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from cnpgen.constraints.constraint import EXACTNESS, Condition
 from cnpgen.errors import DatasetError
 from cnpgen.robots.obstacles import obstacle_tops
-from cnpgen.verify.diagnostics import Diagnostic, stored_diagnostics
+from cnpgen.verify.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
+from cnpgen.verify.fastest_hit import highest_speed
 from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
 from cnpgen.verify.world import World
 
@@ -42,6 +43,7 @@ def verify_rows(
       stands still has ddq = 0, so its static torque is checked;
     * "hit direction", where ``hit_speed`` is positive, and "hit speed", along the hit: of the tip at the goal, if the
       rows have ``hit_angle`` and ``hit_speed``;
+    * "highest hit speed": ``hit_speed_max`` is the optimum of the linear programme that it is defined by;
     * "holding torque ratio" and "clearance": what the rows store of an end as ``start_torque_ratio``,
       ``goal_torque_ratio``, ``start_clearance`` and ``goal_clearance`` is what is computed there.
 
@@ -51,8 +53,8 @@ def verify_rows(
         problem: The problem.
         robot: Its robot.
         columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
-            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``
-            and diagnostics. Other fields must be finite.
+            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``,
+            ``hit_speed_max`` and diagnostics. Other fields must be finite.
         dtype: The float type that the rows are stored in, which decides how exact they must be.
 
     Raises:
@@ -108,12 +110,14 @@ class _Block:
     Attributes:
         position: Tip positions [m], shape (rows, 2, 3); nan where nothing was measured.
         hit_velocity: Tip velocities at the goal [m/s], shape (rows, 3); likewise.
+        hit_jacobian: Jacobians of the tip there [m], shape (rows, 3, n); likewise.
         diagnostics: Those that the rows store.
         conditions: The constraints' conditions, in order of first use.
     """
 
     position: Array
     hit_velocity: Array
+    hit_jacobian: Array
     diagnostics: list[Diagnostic]
     conditions: dict[Key, _Values] = field(default_factory=dict)
 
@@ -131,6 +135,7 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
         _judge_position(block, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in block.conditions.items()),
         *_judge_hit(block, columns, finite, dtype),
+        *_judge_highest(world.robot, block, columns, finite, dtype),
         *(diagnostic.judged(finite, dtype) for diagnostic in block.diagnostics),
     ]
     out = np.unique(np.concatenate([rows_out for _, rows_out in judged]))
@@ -141,7 +146,8 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     """Move the world to both ends of every finite row and note what it measures there."""
     rows = len(columns["start_q"])
     tops = obstacle_tops(problem, columns["start_xyz"], columns["goal_xyz"])
-    block = _Block(np.full((rows, 2, 3), np.nan), np.full((rows, 3), np.nan), stored_diagnostics(problem, columns))
+    position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
+    block = _Block(position, velocity, jacobian, stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):
         (q, dq, ddq), orders = _states(columns, end)
         for row in finite.tolist():
@@ -153,6 +159,8 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
                 diagnostic.note(world, row, index)
             if end == "goal" and "hit_speed" in columns:
                 block.hit_velocity[row] = world.tip_velocity
+            if end == "goal" and "hit_speed_max" in columns:
+                block.hit_jacobian[row] = world.tip_jacobian
     return block
 
 
@@ -198,3 +206,14 @@ def _judge_hit(block: _Block, columns: dict[str, Array], finite: Index, dtype: s
     direction = np.arctan2(across, along)[moving]
     yield judged("hit direction", "rad", direction, finite[moving], "direction")
     yield judged("hit speed", "m/s", along - speed, finite, "velocity")
+
+
+def _judge_highest(
+    robot: "Robot", block: _Block, columns: dict[str, Array], finite: Index, dtype: str
+) -> Iterator[tuple[Check, Index]]:
+    """Judge what is stored as the highest possible speed of a hit."""
+    if "hit_angle" in columns and "hit_speed_max" in columns:
+        highest = highest_speed(block.hit_jacobian[finite], columns["hit_angle"][finite, 0], robot.velocity_limit)
+        error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
+        allowed, end = np.full(len(finite), ALLOWED[dtype]), np.ones(len(finite), np.int64)
+        yield judge("highest hit speed", "m/s", violation=error, allowed=allowed, row=finite, end=end)

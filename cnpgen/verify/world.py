@@ -95,6 +95,14 @@ class World:
         return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).linear)
 
     @property
+    def tip_jacobian(self) -> Array:
+        """Translational Jacobian of the tip in world axes [m], shape (3, n)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.computeFrameJacobian(self._model, self._dynamics_data, self.q, self._tip, frame)[:3])
+
+    @property
     def tip_acceleration(self) -> Array:
         """Linear acceleration of the tip [m/s^2], shape (3,)."""
         import pinocchio as pin
