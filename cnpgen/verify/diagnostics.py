@@ -13,8 +13,8 @@ from cnpgen.verify.world import World
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem
 
-# What stored diagnostics may differ by, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounding
-# of joint positions moves the arm by 1e-7 m and its highest speed by 2e-6 m/s in 40,000 rows: bounds must hold for all.
+# What stored diagnostics may differ by, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounded
+# joint positions move the arm by 1e-7 m and its highest speed by 2e-6 m/s in 40,000 rows: bounds must hold for all.
 ALLOWED = {"float64": 1e-8, "float32": 1e-4}
 
 
