@@ -390,7 +390,7 @@ def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(mon
     meter.close()
     assert "100/300" in terminal.getvalue()
     assert "300/300" in terminal.getvalue()
-    assert "300 draws tried, 66.7% accepted" in terminal.getvalue()
+    assert "300 tried, 66.7% accepted" in terminal.getvalue()
     assert "row/s" in terminal.getvalue()
     assert meter.rows == 200
     assert meter.outcome.tried == 300

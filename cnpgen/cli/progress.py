@@ -75,7 +75,7 @@ class Meter:
             if self.outcome is not None:
                 tried = self._bar.format_sizeof(self.outcome.tried)
                 share = self.outcome.accepted / max(self.outcome.tried, 1)
-                self._bar.set_postfix_str(f"{tried} draws tried, {share:.1%} accepted", refresh=False)
+                self._bar.set_postfix_str(f"{tried} tried, {share:.1%} accepted", refresh=False)
             self._bar.update(rows)
 
     def note(self, text: str) -> None:
