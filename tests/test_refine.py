@@ -10,7 +10,7 @@ from example_plans import PROBLEMS, ROBOTS, Plan, load, raised
 from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
-from cnpgen.recipes import Problem
+from cnpgen.recipes import Problem, TrajectorySpec
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.grid import make_grid
@@ -284,6 +284,18 @@ def test_a_motion_at_rest_that_is_too_fast_is_slowed_down_exactly() -> None:
     factors = good.rate * 1.1 / rate
     assert np.ptp(factors) < 1e-12
     assert 1.0 < factors[0] < 1.12
+
+
+@pytest.mark.parametrize(("degree", "path", "rate"), [(3, 5, 4), (3, 6, 4), (5, 7, 6), (7, 9, 8)])
+def test_any_number_of_control_points_that_plans_may_have_is_refined(degree: int, path: int, rate: int) -> None:
+    plan, asked = load("hit"), TrajectorySpec(degree=degree, path_control_points=path, rate_control_points=rate)
+    still = replace(plan.boundary, goal_dq=0 * plan.boundary.goal_dq)
+    jury = Jury(plan.problem, plan.robot, degree=degree)
+    found = refine_task(refiner_of(plan.problem, spec=asked), jury, task(plan, still))
+    assert (found.path.shape, found.rate.shape) == ((path, 6), (rate,))
+    ends = Motion(found.path[None], found.rate[None], degree).at(np.array([0.0, 1.0])).q[0]
+    np.testing.assert_allclose(ends, [still.start_q[0], still.goal_q[0]], atol=1e-12)
+    assert found.valid == (degree > 3)  # the boundary conditions alone fix most of so few control points
 
 
 def test_the_iteration_never_ends_worse_than_it_began() -> None:

@@ -72,6 +72,17 @@ def test_garbage_among_plans_leaves_the_others_alone(problems: Plans, solved: Pl
     assert same(found.plans.select(others), solved.select(others))
 
 
+@pytest.mark.parametrize("size", [1e3, 1e30, 1e160, 1e300])
+def test_boundary_conditions_beyond_all_measure_leave_the_other_plans_alone(
+    problems: Plans, solved: Plans, size: float
+) -> None:
+    few, b = problems.select(np.arange(3)), problems.boundary[:3]
+    huge = replace(b, start_q=b.start_q * [[size], [1], [1]], goal_dq=b.goal_dq * [[1], [1], [size]])
+    found = refine_plans(replace(few, boundary=huge), workers=1)
+    assert found.valid.tolist() == [False, True, False]
+    assert same(found.plans.select(np.array([1])), solved.select(np.array([1])))
+
+
 def test_plans_that_take_days_are_made_as_if_there_were_none(problems: Plans, solved: Plans) -> None:
     some = slice(0, 3)
     few = solved.select(some)
@@ -98,10 +109,12 @@ def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
     assert refine_plans(solved, options=RefineOptions(max_iterations=0)).valid.all()
     task = draw_problems("heavy-object", 1)
     plan = refine_plans(task).plans
-    fast = replace(plan, rate_control_points=1.05 * plan.rate_control_points)
-    found = refine_plans(fast, options=RefineOptions(max_iterations=0))
-    assert [each.outcome for each in found.refined] == [Outcome.SLOWED]
-    np.testing.assert_allclose(found.plans.path_control_points, fast.path_control_points, atol=1e-12)
+    for factor in (1.05, 2.0):
+        fast = replace(plan, rate_control_points=factor * plan.rate_control_points)
+        found = refine_plans(fast, options=RefineOptions(max_iterations=0))
+        assert [each.outcome for each in found.refined] == [Outcome.SLOWED]
+        np.testing.assert_allclose(found.plans.path_control_points, fast.path_control_points, atol=1e-12)
+        assert plan.duration[0] <= found.plans.duration[0] < 1.02 * plan.duration[0]
     (nothing,) = refine_plans(task, options=RefineOptions(max_iterations=0)).refined
     assert (nothing.valid, nothing.iterations) == (False, 0)
 

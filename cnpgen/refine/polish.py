@@ -88,6 +88,7 @@ class _Search:
         return self.weigh(path, rate, attempt.outcome)
 
 
+@np.errstate(all="ignore")  # boundary conditions may be so large that squares of them are no numbers
 def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
     """Refine the plan of a task, or make one.
 

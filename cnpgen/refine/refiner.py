@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 SLOWEST = 60.0  # s: a plan that takes longer is no start
 LOWEST_RATE = 1e-3  # of a plan's largest rate control point
+LOST = 10.0  # boundary states further outside, in scaled units, are no problem that steps could solve
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 
 
@@ -141,25 +142,25 @@ class Refiner:
             task: What to plan; its boundary conditions are numbers.
             given: What ``given`` says of it.
         """
-        repaired = self._slowed(task, given) if given is not None and given.excess > 1 and task.at_rest else given
-        if self.settings.max_iterations == 0:
+        slowing, repaired = self.settings.max_iterations == 0, given
+        if given is not None and given.excess > 1 and task.at_rest:
+            repaired = self._slowed(task, given, at_any_cost=slowing)
+        if slowing:
             yield repaired if repaired is not None else self._measured(task, self._straight(task))
             return
         usable = repaired is not None and repaired.excess < np.inf
         x = repaired.x if repaired is not None and usable else self._straight(task)
         best = self._attempt(task, self.passes.first, x, Outcome.SOLVED, warm=usable)
-        if best.excess > 1 and task.at_rest:
-            best = self._slowed(task, best)
         yield best
-        polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
-        yield polished
-        if repaired is not None and repaired.outcome is Outcome.SLOWED and repaired.excess <= 1:
-            yield repaired
-        best = polished if polished.is_better(best) else best
-        yield self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED, warm=True)
+        for which in (self.passes.polish, self.passes.strict):
+            polished = self._attempt(task, which, best.x, Outcome.POLISHED, warm=True)
+            yield polished
+            if which is self.passes.polish and repaired is not None and repaired.outcome is Outcome.SLOWED:
+                yield repaired
+            best = polished if polished.is_better(best) else best
         for start in self._other_starts(task):
             other = self._attempt(task, self.passes.other, _variables(start), Outcome.RESTARTED)
-            yield self._slowed(task, other) if other.excess > 1 and task.at_rest else other
+            yield other
             best = other if other.is_better(best) else best
         if task.at_rest:  # what is left to be said of it is why no speed is slow enough
             yield self._slowed(task, best, at_any_cost=True)
@@ -168,7 +169,10 @@ class Refiner:
         """Run one pass from x."""
         settings = replace(which.settings, radius=min(which.settings.radius, WARM_RADIUS)) if warm else which.settings
         motion = self.transcription(task, which)
-        bounds = self._bounds[which].of(task.start_xyz, ends=motion.end_residuals())
+        ends = motion.end_residuals()
+        bounds = self._bounds[which].of(task.start_xyz, ends=ends)
+        if not bounds.beyond(ends) < LOST:
+            settings = replace(settings, max_iterations=0)
         return self._minimise(motion, bounds, x, settings)
 
     def transcription(self, task: Task, which: Pass) -> Transcription:
@@ -185,7 +189,8 @@ class Refiner:
     def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, *, warm: bool = False) -> Attempt:
         result = self.minimise(task, which, x, warm=warm)
         cost, excess = self.check.measure(task, result.x)
-        return Attempt(result.x, excess.worst, cost, outcome, result.iterations)
+        attempt = Attempt(result.x, excess.worst, cost, outcome, result.iterations)
+        return self._slowed(task, attempt) if attempt.excess > 1 and task.at_rest else attempt
 
     def _slowed(self, task: Task, attempt: Attempt, *, at_any_cost: bool = False) -> Attempt:
         motion = self.check.transcription(task)

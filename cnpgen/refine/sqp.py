@@ -4,6 +4,9 @@ Each step minimises a quadratic model of the objective subject to the linearised
 relaxed by one elastic variable: the step may leave the fraction ``beta`` of every violation. The merit function is
 the objective plus a multiple of the worst violation. A proximal term on the step makes the model strictly convex
 where the objective is flat.
+
+A merit function alone refuses good steps along a curved manifold, since they leave it by their square (Maratos). So a
+step is also taken for the objective's sake if it violates no more than the width of a funnel, which narrows each time.
 """
 
 from dataclasses import dataclass
@@ -23,6 +26,7 @@ LEAP = 1.5  # the next step may be longer than the last one by this factor
 NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the first, residuals this near are held
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
+FUNNEL, NARROWER, WORTH = 0.3, 0.7, 0.1  # first width, what is left of it each time, share of the promised gain
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
@@ -105,7 +109,7 @@ class _Descent:
         self._motion, self._bounds, self._settings = motion, bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
-        self._radius = settings.radius
+        self._radius, self._funnel = settings.radius, FUNNEL
         self._length = 1.0 if settings.radius > WIDE else 0.2  # of the last step, in the same norm
         self._multipliers: Array | None = None
         self._missed = np.zeros(at.g.shape, bool)  # residuals that a rejected step broke unseen
@@ -125,10 +129,9 @@ class _Descent:
         self.ended |= self._radius < SMALLEST or self._is_stuck()
 
     def _is_stuck(self) -> bool:
-        """Whether the violation hardly falls any more."""
-        if self.violation < self._settings.violation_tolerance or len(self._violations) <= PATIENCE:
-            return False
-        return self.violation > PROGRESS * self._violations[-1 - PATIENCE]
+        """Whether it was never feasible, and the least violation hardly falls any more."""
+        before, recent = self._violations[:-PATIENCE], self._violations[-PATIENCE:]
+        return bool(before) and min(recent) > max(PROGRESS * min(before), self._settings.violation_tolerance)
 
     def _held(self, at: Evaluation) -> Mask:
         """Choose the residuals of the next quadratic programme."""
@@ -152,12 +155,16 @@ class _Descent:
         x = self.x + step.dx
         cost, g = self._motion.value(x)
         violation = self._bounds.violation(g)
-        predicted = -model.cost(step.dx) + settings.penalty * self.violation * (1 - step.left)
+        gain = -model.cost(step.dx)
+        predicted = gain + settings.penalty * self.violation * (1 - step.left)
         reduction = self.cost - cost + settings.penalty * (self.violation - violation)
         size = float(np.abs(step.dx / self._scale).max())
-        if np.isfinite(reduction) and reduction > ENOUGH * predicted:
-            if reduction > GOOD * predicted and size > 0.8 * self._radius:
-                self._radius = min(2.5 * self._radius, LARGEST)
+        cheaper = violation <= self._funnel and self.cost - cost > WORTH * gain > 0
+        if np.isfinite(reduction) and (cheaper or reduction > ENOUGH * predicted):
+            if reduction <= ENOUGH * predicted:
+                self._funnel *= NARROWER
+            if cheaper or reduction > GOOD * predicted:
+                self._radius = min(2.5 * self._radius, LARGEST) if size > 0.8 * self._radius else self._radius
             elif reduction < POOR * predicted:
                 self._radius *= 0.5
             feasible = violation < settings.violation_tolerance

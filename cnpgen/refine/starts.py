@@ -24,6 +24,8 @@ def straight(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) ->
 def through(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec, *, middle: Array) -> tuple[Array, Array]:
     """The same, bent towards a configuration half way."""
     interior, rate = straight(boundary, velocity_limit, spec)
+    if not len(interior):  # the ends alone decide where a motion of so few control points goes
+        return interior, rate
     along = np.linspace(0, 1, len(interior))[:, None]
     bend = 4 * along * (1 - along)
     chord = (interior[0] + interior[-1]) / 2

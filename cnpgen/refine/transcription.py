@@ -16,7 +16,7 @@ from cnpgen.recipes import TrajectorySpec
 from cnpgen.refine.criterion import Criterion
 from cnpgen.refine.grid import Bases, Grid
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.spline import end_derivatives
+from cnpgen.trajectory.slopes import boundary_slopes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -144,7 +144,7 @@ class Transcription:
         curvature[self.split :, self.split :] = bent + self._smooth
         if self.stage.criterion is not None:
             cost += self._add_criterion(path, rate, gradient, curvature)
-        return Evaluation(x, cost, gradient, curvature, g.T, jacobian.reshape(w.shape[0], g.shape[0], -1), rate)
+        return Evaluation(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
 
     def rows(self, at: Evaluation, k: Indices, which: Indices) -> Array:
         """Gradients of chosen residuals with respect to the variables.
@@ -177,7 +177,7 @@ class Transcription:
         w = self.grid.criterion.states(path, rate)
         e, jacobian = self.stage.residuals(w)
         share = self.stage.criterion.weight * self.grid.criterion_weights / w[4 * self.n]
-        return e, jacobian.reshape(len(w), len(e), -1), share
+        return e, jacobian.reshape(len(w), *e.shape), share
 
     def _criterion(self, path: Array, rate: Array) -> float:
         """Return the criterion's cost."""
@@ -206,29 +206,8 @@ class Transcription:
         control = bases.path_at[k] @ stage[:, : orders * n].reshape(m, orders, n)
         out = np.empty((m, self.nx))
         end = self.spec.path_control_points - self.boundary.fixed_at_goal
-        out[:, : self.split] = control[:, 3:end].reshape(m, -1)
+        out[:, : self.split] = control[:, 3:end].reshape(m, self.split)
         out[:, self.split :] = (bases.rate_at[k] @ stage[:, orders * n :, None])[..., 0] * rate
-        for point, variable, derivative in self._boundary_slopes(rate):
-            out[:, self.split + variable] += control[:, point] @ derivative
+        for each in boundary_slopes(self.boundary, rate[None], self.spec):
+            out[:, self.split + each.variable] += control[:, each.point] @ (each.slope[0] * rate[each.variable])
         return out
-
-    def _boundary_slopes(self, rate: Array) -> list[tuple[int, int, Array]]:
-        """Derivatives of the boundary control points with respect to log r: (point, variable, derivative)."""
-        b, last, points = self.boundary, self.spec.rate_control_points - 1, self.spec.path_control_points
-        first = self._end_slopes(b.start_dq[0], b.start_ddq[0], rate[0], rate[1])
-        slopes = [(1, 0, first[0]), (2, 0, first[1]), (2, 1, first[2])]
-        goal = np.zeros(self.n) if b.goal_ddq is None else b.goal_ddq[0]
-        final = self._end_slopes(-b.goal_dq[0], goal, rate[-1], rate[-2])
-        slopes.append((points - 2, last, final[0]))
-        if b.goal_ddq is not None:
-            slopes += [(points - 3, last, final[1]), (points - 3, last - 1, final[2])]
-        return slopes
-
-    def _end_slopes(self, dq: Array, ddq: Array, outer: float, inner: float) -> tuple[Array, Array, Array]:
-        """Return d c1 / d log r0, d c2 / d log r0 and d c2 / d log r1 at one end."""
-        path = end_derivatives(self.spec.path_control_points, self.spec.degree)
-        eta = end_derivatives(self.spec.rate_control_points, self.spec.degree).eta
-        c1 = -dq / (outer * path.eta)
-        second = (ddq - dq * eta * (inner - outer)) / outer**2
-        c2 = (-2 * second + dq * eta / outer) / path.beta + 3 * c1
-        return c1, c2, -dq * eta * inner / outer**2 / path.beta

@@ -1,4 +1,4 @@
-"""How the boundary control points move with the rate: the derivatives that training and refining go back through."""
+"""How the boundary control points move with the rate control points: what gradients of motions are pulled back through."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -39,12 +39,16 @@ def boundary_slopes(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> li
     b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
     c1, c2, c2_inner = _end_slopes(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)
     slopes = [BoundarySlope(1, 0, c1), BoundarySlope(2, 0, c2), BoundarySlope(2, 1, c2_inner)]
-    goal_ddq = np.zeros_like(b.goal_q) if b.goal_ddq is None else b.goal_ddq
-    c1, c2, c2_inner = _end_slopes(-b.goal_dq, goal_ddq, rate[:, -1:], rate[:, -2:-1], spec)
-    slopes.append(BoundarySlope(points - 2, last, c1))
-    if b.goal_ddq is not None:
-        slopes += [BoundarySlope(points - 3, last, c2), BoundarySlope(points - 3, last - 1, c2_inner)]
-    return slopes
+    if b.goal_ddq is None:
+        return [*slopes, BoundarySlope(points - 2, last, _first_slope(-b.goal_dq, rate[:, -1:], spec))]
+    c1, c2, c2_inner = _end_slopes(-b.goal_dq, b.goal_ddq, rate[:, -1:], rate[:, -2:-1], spec)
+    slopes += [BoundarySlope(points - 2, last, c1), BoundarySlope(points - 3, last, c2)]
+    return [*slopes, BoundarySlope(points - 3, last - 1, c2_inner)]
+
+
+def _first_slope(dq: Array, outer: Array, spec: TrajectorySpec) -> Array:
+    """Return dc1/dr0 at the end where the path has velocity dq, with ``c1 = q + p' / eta`` and ``p' = dq / r0``."""
+    return np.asarray(-dq / (outer**2 * end_derivatives(spec.path_control_points, spec.degree).eta))
 
 
 def _end_slopes(dq: Array, ddq: Array, outer: Array, inner: Array, spec: TrajectorySpec) -> tuple[Array, Array, Array]:
@@ -55,6 +59,6 @@ def _end_slopes(dq: Array, ddq: Array, outer: Array, inner: Array, spec: Traject
     """
     path = end_derivatives(spec.path_control_points, spec.degree)
     eta = end_derivatives(spec.rate_control_points, spec.degree).eta
-    c1 = -dq / (outer**2 * path.eta)
+    c1 = _first_slope(dq, outer, spec)
     second = (-2 * (ddq - dq * eta * (inner - outer)) / outer + dq * eta) / outer**2
     return c1, second / path.beta + 3 * c1, -dq * eta / (outer**2 * path.beta)
