@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points
-EDGE = 0.05  # phase over which tightening fades in: boundary states may sit on a limit
 EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exceed within the tolerances
 
 
@@ -28,12 +27,14 @@ class Tightening:
         gentle: Fraction of position and velocity limits (boundary velocities sit on the limit).
         clearance: Distance added to clearances [m].
         band: Half width of equalities, as a fraction of their tolerance.
+        edge: Phase over which it fades in from either end: boundary states may sit on a limit.
     """
 
     limit: float
     gentle: float
     clearance: float
     band: float
+    edge: float
 
 
 @dataclass(frozen=True)
@@ -137,14 +138,14 @@ def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: 
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
     if condition.exactness == "limit":
         fraction = tightening.limit if condition.needs == 2 else tightening.gentle
-        shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / EDGE, 0, 1)[:, None]
+        shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
         middle, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = middle - shrink * half, middle + shrink * half
     elif np.array_equal(condition.lower, condition.upper):
         band = tightening.band * constraint.tolerance / scale
         lower, upper = lower - band, upper + band
     else:
-        inside = tightening.clearance * np.clip(np.minimum(s, 1 - s) / EDGE, 0, 1)[:, None] / scale
+        inside = tightening.clearance * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None] / scale
         lower, upper = lower + inside, upper - inside
     if condition.needs < 2:  # fixed by the boundary conditions
         lower[s == 1], upper[s == 1] = -np.inf, np.inf

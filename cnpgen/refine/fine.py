@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 POINTS = 600
 ATTEMPTS = 6
+ROUNDING = 1e-12  # of scaled residuals; less cannot be told from what is exactly allowed
 LARGEST = 1.25  # a motion that must be slower than this is another motion: the optimiser finds a better one
 
 
@@ -50,7 +51,8 @@ class FineCheck:
     def __init__(self, problem: Problem, world: "World", stage: Stage) -> None:
         self._stage = stage
         self._grid = make_grid(stage.spec, POINTS)
-        self._bounds = BoundsTemplate(problem, world, self._grid.s, Tightening(0.0, 0.0, 0.0, 0.0))
+        none = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
+        self._bounds = BoundsTemplate(problem, world, self._grid.s, none)
         conditions = [(each, condition) for each in problem.constraint for condition in each.measured(world)]
         self._allowed = np.concatenate(
             [
@@ -72,7 +74,7 @@ class FineCheck:
         bounds = self._bounds.of(task.start_xyz)
         with np.errstate(invalid="ignore"):
             beyond = np.maximum(g - bounds.upper, bounds.lower - g)
-        ratio = beyond / self._allowed
+        ratio = beyond / np.maximum(self._allowed, ROUNDING)
         worst = float(ratio.max())
         if not np.isfinite(worst):
             return cost, Excess(np.inf, True, np.inf)

@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 SLOWEST = 60.0  # s: a plan that takes longer is no start
 LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 LOST = 10.0  # boundary states further outside, in scaled units, are no problem that steps could solve
+EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the ends need the later one
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 
 
@@ -62,13 +63,16 @@ class Passes:
 def default_passes(problem: Problem, settings: Settings) -> Passes:
     """Choose grids and tightening; obstacles need more room between the points of a grid."""
     crowded = bool(problem.obstacle)
-    room = Tightening(limit=4e-3 if crowded else 3e-3, gentle=1e-3 if crowded else 1e-4, clearance=1e-3, band=0.09)
-    finer = replace(room, limit=4e-3)
-    strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05)
+    gentle, edge = (1e-3, LATE) if crowded else (1e-4, EARLY)
+    room = Tightening(limit=4e-3, gentle=gentle, clearance=1e-3, band=0.09, edge=edge)
+    strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE)
     short = replace(settings, radius=WARM_RADIUS, max_iterations=settings.max_iterations // 2)
     longer = replace(settings, max_iterations=settings.max_iterations * 3 // 2)
     return Passes(
-        Pass(128, room, settings), Pass(256, finer, short), Pass(256, strict, short), Pass(192, finer, longer)
+        Pass(128, room, settings),
+        Pass(256, room, short),
+        Pass(256, strict, short),
+        Pass(192, replace(room, edge=strict.edge), longer),
     )
 
 
