@@ -244,6 +244,16 @@ def test_another_problem_s_file_is_refused(tmp_path: Path, change: Callable[[Any
         load_plans(tmp_path / "plan.h5", problem="heavy-object")
 
 
+def test_constraints_of_one_kind_all_count() -> None:
+    once = json.loads(RECORD.recipe)
+    table = next(each for each in once["constraint"] if each["use"] == "table")
+    twice, others = (once | {"constraint": [*once["constraint"], table | {"x": x}]} for x in (table["x"], [0.9, 1.0]))
+    narrow = once | {"constraint": [table | {"x": [0.9, 1.0]}, *once["constraint"]]}
+    records = [ProblemRecord(json.dumps(each), RECORD.urdf) for each in (once, twice, others, narrow)]
+    assert len({record.digest for record in records}) == 4
+    assert records[1].differences(records[2]) == ["constraint.table 2.x"]
+
+
 def test_another_robot_file_is_another_problem() -> None:
     other = ProblemRecord(RECORD.recipe, RECORD.urdf.replace("iiwa14", "iiwa15", 1))
     assert other.urdf != RECORD.urdf

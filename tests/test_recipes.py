@@ -1,6 +1,7 @@
 """Problem, Pipeline and DatasetRecipe: splits, resolved values, identity."""
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -176,3 +177,14 @@ def test_an_object_must_be_thicker_than_its_contacts_may_be_deep(tmp_path):
     with pytest.raises(RecipeError, match=r"object: is 0.002 m thin, where contacts 0.001 m deep are legal"):
         load_problem(thin_object(tmp_path, "[200, 200, 2] mm"))
     assert load_problem(thin_object(tmp_path, "[200, 200, 2.1] mm")).object.size[2] == 0.0021
+
+
+@pytest.mark.parametrize(("name", "key"), [("airhockey", "table"), ("heavy-object", "vertical")])
+def test_no_motion_can_be_asked_to_hold_an_equality_with_a_tolerance_of_zero(tmp_path, name, key):
+    path = tmp_path / "problem.toml"
+    shipped = load_problem(name)
+    text = shipped.path.read_text().replace(shipped.robot.urdf, str(shipped.urdf_path))
+    head, rest = text.split(f'use = "{key}"')
+    path.write_text(f'{head}use = "{key}"' + re.sub(r"(?m)^tolerance = .*$", "tolerance = 0", rest, count=1))
+    with pytest.raises(RecipeError, match=r"tolerance: 0\.0 m?(rad)? is too small, expected at least 1e-09"):
+        load_problem(path)

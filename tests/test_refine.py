@@ -286,6 +286,19 @@ def test_a_motion_at_rest_that_is_too_fast_is_slowed_down_exactly() -> None:
     assert 1.0 < factors[0] < 1.12
 
 
+@pytest.mark.parametrize("kind", ["JointPosition", "JointVelocity", "JointAcceleration", "JointTorque", "Table"])
+def test_a_tolerance_of_zero_is_held_exactly_or_honestly_missed(kind: str) -> None:
+    plan = load("hit").with_constraint(kind, tolerance=0.0)
+    tool, asked = refiner_of(plan.problem), task(plan)
+    x = tool.check.transcription(asked).pack(plan.motion.path[0], plan.motion.rate[0])
+    assert np.isfinite(tool.check.measure(asked, x)[1].worst)
+    found = refine(plan)
+    assert verdict(plan, plan.boundary, found.path, found.rate).valid == found.valid
+    assert found.valid == (
+        kind not in {"Table", "JointVelocity"}
+    )  # this goal is at its velocity limit, but for rounding
+
+
 @pytest.mark.parametrize(("degree", "path", "rate"), [(3, 5, 4), (3, 6, 4), (5, 7, 6), (7, 9, 8)])
 def test_any_number_of_control_points_that_plans_may_have_is_refined(degree: int, path: int, rate: int) -> None:
     plan, asked = load("hit"), TrajectorySpec(degree=degree, path_control_points=path, rate_control_points=rate)

@@ -1,5 +1,6 @@
 """The journal: whole frames count, damaged or foreign ones are as if they had never been written."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -112,3 +113,23 @@ def test_two_processes_do_not_share_a_journal(tmp_path: Path) -> None:
 def test_a_place_where_nothing_can_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(MachineError, match="nowhere"):
         open_journal(tmp_path / "nowhere" / "part", IDENTITY)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks")
+def test_a_journal_that_appears_while_it_is_opened_is_not_emptied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, begun, really = tmp_path / "part", [], os.open
+
+    def late(name: str, flags: int, *mode: int) -> int:
+        if not begun:
+            begun.append(True)
+            begun[0] = open_journal(path, IDENTITY)
+            begun[0].append([0], [refined(0)])
+        return really(name, flags, *mode)
+
+    monkeypatch.setattr(os, "open", late)
+    with pytest.raises(UsageError, match="is in use"):
+        open_journal(path, IDENTITY)
+    begun[0].close()
+    assert sorted(kept(path)) == [0]

@@ -12,7 +12,6 @@ from cnpgen.trajectory.spline import (
     chebyshev,
     clamped_knots,
     end_derivatives,
-    gauss_rule,
     graded_edges,
     horner,
     lowest,
@@ -87,15 +86,6 @@ def test_the_lowest_value_is_found_between_any_samples() -> None:
         assert sampled - 1e-5 <= lowest(control, 7) <= sampled + 1e-14
     assert lowest(np.full(20, 0.7), 7) == pytest.approx(0.7, rel=1e-14)  # no turning points at all
     assert lowest(np.arange(20.0) + 1, 7) == 1.0  # at an end
-
-
-def test_gauss_rule_is_exact_on_every_span() -> None:
-    s, weights = gauss_rule(20, 7)
-    values = basis(s, 20, 7)
-    squares = BSpline(clamped_knots(20, 7), np.eye(20), 7)
-    dense, more = gauss_rule(20, 7, 20)
-    assert weights.sum() == pytest.approx(1, rel=1e-14)
-    assert np.abs((values**2).T @ weights - (squares(dense) ** 2).T @ more).max() < 1e-15
 
 
 @pytest.mark.parametrize(("points", "degree"), SIZES)

@@ -96,6 +96,9 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
             begin=lambda total, there: meter.begin(title, total, there),
             progress=progress,
         )
+        facts = found.summary()
+        if arguments.explain:
+            _explain(facts, found, meter)
     except KeyboardInterrupt as interruption:
         kept = f"{journal} keeps what is finished, run the same command again to go on"
         raise type(interruption)(kept) from interruption
@@ -103,7 +106,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
         meter.close()
     save_plans(out, found.plans)
     journal.unlink(missing_ok=True)
-    _tell(arguments, found, out, meter.seconds)
+    _tell(arguments, facts, out, meter.seconds)
     return 0 if found.valid.all() else 1
 
 
@@ -117,25 +120,23 @@ def check_place(out: Path, *, force: bool) -> None:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")
 
 
-def _tell(arguments: argparse.Namespace, found: "Refinement", out: Path, seconds: float) -> None:
-    facts = found.summary()
-    if arguments.explain:
-        _explain(facts, found)
+def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, seconds: float) -> None:
     if not arguments.quiet:
-        lines = _summary(facts, seconds, listed=len(found.refined) if arguments.explain else LISTED)
+        lines = _summary(facts, seconds, listed=facts["plans"] if arguments.explain else LISTED)
         print("\n".join(lines), file=sys.stderr)
     print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
 
 
-def _explain(facts: dict[str, Any], found: "Refinement") -> None:
+def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
     """Add to the facts about plans that are not valid what is proven about their problems."""
     from cnpgen.refine.proof import explain_plans
 
-    failures = facts["not_valid"]
-    findings = explain_plans(found.plans, [failure["plan"] for failure in failures])
-    for failure in failures:
-        finding = findings[failure["plan"]]
+    if facts["not_valid"]:
+        meter.begin("explaining", len(facts["not_valid"]))
+    for failure in facts["not_valid"]:
+        (finding,) = explain_plans(found.plans, [failure["plan"]]).values()
         failure |= {"finding": str(finding.kind), "explanation": finding.text}
+        meter(1)
 
 
 def _summary(facts: dict[str, Any], seconds: float, *, listed: int) -> list[str]:

@@ -37,8 +37,13 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     plans = _problems(arguments)
-    out = arguments.out or Path(f"{Path(arguments.what).stem}-plans.h5")
+    out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
     return refine_and_save(arguments, plans, out, title=f"solving {arguments.what}")
+
+
+def _name(what: Path) -> str:
+    """Return what plans are called after: a folder, whatever dots are in its name, or a recipe."""
+    return what.resolve().name if what.is_dir() else what.stem
 
 
 def _problems(arguments: argparse.Namespace) -> "Plans":

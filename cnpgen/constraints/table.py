@@ -25,7 +25,7 @@ class Table(Constraint):
     y: Range = field("where the tip may be along world y", unit="m")
     z: float = field("height of the tip when the mallet lies on the table", unit="m")
     start_band: float = field("how far above or below a motion may start", unit="m", default=0.0, low=0.0)
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="m", low=0.0)
+    tolerance: float = field("how far a motion may be off and still be called valid", unit="m", low=1e-9)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the rectangle and the height [m]."""

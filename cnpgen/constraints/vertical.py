@@ -22,7 +22,7 @@ class Vertical(Constraint):
     """
 
     reason = "not vertical"
-    tolerance: float = field("how far a motion may tilt and still be called valid", unit="rad", low=0.0)
+    tolerance: float = field("how far a motion may tilt and still be called valid", unit="rad", low=1e-9)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tilt [rad]."""

@@ -138,9 +138,11 @@ def _meaning(record: ProblemRecord) -> dict[str, Any]:
     }
     robot = {key: value for key, value in kept["robot"].items() if key not in {"urdf", "base"}}
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
-    constraints = {
-        kind["use"]: {key: value for key, value in kind.items() if key not in _JUDGED_BY} for kind in kept["constraint"]
-    }
+    constraints: dict[str, Any] = {}
+    for kind in kept["constraint"]:
+        count = sum(name.split()[0] == kind["use"] for name in constraints)
+        name = f"{kind['use']} {count + 1}" if count else kind["use"]
+        constraints[name] = {key: value for key, value in kind.items() if key not in _JUDGED_BY}
     return kept | {"robot": robot, "constraint": constraints}
 
 

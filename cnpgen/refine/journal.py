@@ -72,7 +72,7 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
         MachineError: The file cannot be opened.
     """
     try:
-        file = path.open("r+b" if path.exists() else "w+b")
+        file = open(path, "r+b", opener=_make)  # noqa: PTH123 - only this one takes an opener
     except OSError as error:
         raise MachineError(f"{path}: {error.strerror or error}") from error
     try:
@@ -83,6 +83,11 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
     except BaseException:
         file.close()
         raise
+
+
+def _make(path: str, flags: int) -> int:
+    """Open a file, made if it is missing: what is in it is not touched before it is locked."""
+    return os.open(path, flags | os.O_CREAT, 0o666)
 
 
 def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Journal:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 DISTANCE = 0.1  # m
 TOLERANCES = 20
+FINEST = 1e-9  # a tolerance of zero is taken for this
 
 
 def stage_values(robot: "Robot", problem: Problem) -> Any:
@@ -58,4 +59,4 @@ def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> A
     """
     if kind == "limit":
         return np.maximum(np.abs(lower), np.abs(upper))
-    return np.where(lower == upper, TOLERANCES * tolerance, DISTANCE)
+    return np.where(lower == upper, TOLERANCES * max(tolerance, FINEST), DISTANCE)

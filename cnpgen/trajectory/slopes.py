@@ -1,4 +1,4 @@
-"""How the boundary control points move with the rate control points: what gradients of motions are pulled back through."""
+"""How the boundary control points move with those of the rate: what gradients of motions are pulled back through."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -143,16 +143,3 @@ def graded_edges(points: int, degree: int) -> Array:
     spans = points - degree
     end = 0.5 ** np.arange(24, 2, -1)
     return np.unique(np.concatenate([np.linspace(0, spans, 4 * spans + 1), end, spans - end])) / spans
-
-
-@cache
-def gauss_rule(points: int, degree: int, per_span: int = 8) -> tuple[Array, Array]:
-    """Composite Gauss-Legendre rule on [0, 1] that respects the knots.
-
-    Returns:
-        ``(s, weights)``, both of shape (spans * per_span,).
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(per_span)
-    edges = np.linspace(0, 1, points - degree + 1)
-    width = np.diff(edges)[:, None]
-    return (edges[:-1, None] + width * (nodes + 1) / 2).ravel(), (width * weights / 2).ravel()
