@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from example_plans import load
-from test_refine import refiner, task, transcription
+from example_refiner import refiner, task
+from test_refine import transcription
 
 from cnpgen.refine.alternatives import minimise_with
 from cnpgen.refine.callbacks import Callbacks

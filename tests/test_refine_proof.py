@@ -9,13 +9,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from example_plans import ROBOTS, Plan, load, raised
+from example_refiner import refine
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
+from cnpgen.refine import table_proof
 from cnpgen.refine.proof import Finding, Kind, explain_failure, explain_plans
-from cnpgen.refine.reachable import Departure, joint_limits, moments
+from cnpgen.refine.reachable import Departure, JointLimits, departures, joint_limits, moments
 from cnpgen.refine.table_proof import table_bounds
 from cnpgen.refine.tip_bound import Arm, bound_projection
 from cnpgen.refinement import refine_plans
@@ -72,18 +74,65 @@ def test_no_solved_problem_is_called_infeasible(name: str, count: int) -> None:
     assert Kind.INFEASIBLE not in {each.kind for each in found.values()}
 
 
+def mirrored(plan: Plan) -> Plan:
+    """The problem with time running backwards, at rest where it began."""
+    b = plan.boundary
+    backwards = Boundary(b.goal_q, -b.goal_dq, 0 * b.start_ddq, b.start_q, -b.start_dq)
+    return replace(plan, boundary=backwards, start_xyz=plan.goal_xyz, goal_xyz=plan.start_xyz)
+
+
+def off_the_height(plan: Plan, by: float) -> Plan:
+    """The problem starting ``by`` [m] off the table at the same velocity of the tip."""
+    speed = Arm(plan.robot).at(plan.boundary.start_q[0]).jacobian @ plan.boundary.start_dq[0]
+    high = raised(plan, by)
+    dq = np.linalg.pinv(Arm(plan.robot).at(high.boundary.start_q[0]).jacobian) @ speed
+    return replace(high, boundary=replace(high.boundary, start_dq=dq[None]))
+
+
+@pytest.mark.parametrize(
+    ("plan", "always"),
+    [
+        (mirrored(at_the_edge(0.0145, 1.0)), False),
+        (mirrored(at_the_edge(0.015, 1.0)), True),
+        (at_the_edge(0.016, 1.0), True),
+        (off_the_height(at_the_edge(0.016, 1.0), 3e-3), True),
+        (off_the_height(at_the_edge(0.016, 1.0), -4e-3), True),
+    ],
+    ids=["goal on the verge", "goal", "start", "above", "below"],
+)
+def test_proofs_about_solved_problems_at_the_edge_are_tried_and_fail(
+    plan: Plan, always: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, prove = [], table_proof._prove
+    monkeypatch.setattr(table_proof, "_prove", lambda *given: calls.append(given) or prove(*given))
+    if always:  # nothing is left out for having room
+        monkeypatch.setattr(table_proof, "VERGE", 1.0)
+        monkeypatch.setattr(table_proof, "CARRIED", -1.0)
+    assert refine(plan).valid
+    assert explain_case(plan).kind is Kind.VERGE
+    assert calls
+
+
 @pytest.mark.parametrize("label", LABELS)
 def test_valid_motions_stay_in_the_boxes_that_their_ends_allow(label: str) -> None:
     plan = load(label)
     limits = joint_limits(plan.problem, plan.robot, tolerances=1.0)
     times = moments(plan.boundary, limits)
-    phase = plan.motion.phase_at(times[None])[0]
-    q = plan.motion.at(phase).q[0]
-    start = Departure(plan.boundary.start_q[0], plan.boundary.start_dq[0])
-    for time, where in zip(times, q, strict=True):
-        lower, upper = start.box(float(time), limits)
-        assert (lower <= where).all()
-        assert (where <= upper).all()
+    assert len(times) > 5
+    for end, departure in departures(plan.boundary).items():
+        phase = plan.motion.phase_at((times if end == "start" else plan.motion.duration()[0] - times)[None])[0]
+        for time, where in zip(times, plan.motion.at(phase).q[0], strict=True):
+            lower, upper = departure.box(float(time), limits)
+            assert (lower <= where).all()
+            assert (where <= upper).all()
+
+
+@pytest.mark.parametrize(("steps", "last"), [(148, 0.14), (149, 0.14), (150, 0.14), (152, 0.15)])
+def test_no_moment_is_looked_at_when_a_motion_may_be_over(steps: int, last: float) -> None:
+    still = np.zeros((1, 1))
+    limits = JointLimits(*(np.array([limit]) for limit in (-9.0, 9.0, 1.0, 1e9)))
+    boundary = Boundary(still, still, still, still + (steps - 0.5) * 1e-3, still)
+    assert moments(boundary, limits)[-1] == pytest.approx(last)
 
 
 def test_a_joint_is_farthest_where_full_acceleration_up_to_the_velocity_limit_takes_it() -> None:
@@ -136,10 +185,7 @@ def test_a_tip_that_cannot_stop_before_the_edge_is_proven_to_leave_the_table() -
 
 def test_the_same_at_the_goal() -> None:
     plan = at_the_edge(clearance=0.01, speed=1.5)
-    b = plan.boundary
-    backwards = Boundary(b.goal_q, -b.goal_dq, 0 * b.start_ddq, b.start_q, -b.start_dq)
-    swapped = replace(plan, boundary=backwards, start_xyz=plan.goal_xyz, goal_xyz=plan.start_xyz)
-    finding = explain_case(swapped)
+    finding = explain_case(mirrored(plan))
     assert finding.kind is Kind.INFEASIBLE
     assert "before the goal the tip is" in finding.text
 
@@ -186,6 +232,15 @@ def test_ends_that_break_a_constraint_are_named_with_value_and_bound() -> None:
     heavy = explain_case(transport.with_constraint("RobotClearance", radius=0.5))
     assert heavy.text.startswith("at the start robot clearance is")
     assert "expected 0.5 m" in heavy.text
+
+
+def test_ends_are_held_to_no_more_than_the_verdict_holds_them_to() -> None:
+    hit = load("hit")
+    limit = hit.robot.acceleration_limit * 1.005
+    for beyond, kind in ((9e-5, Kind.UNKNOWN), (0.1, Kind.INFEASIBLE)):  # 1e-4 rad/s^2 may be missed
+        start_ddq = np.zeros((1, 6))
+        start_ddq[0, 5] = limit[5] + beyond
+        assert explain(hit, start_ddq=start_ddq).kind is kind
 
 
 def test_a_goal_whose_torque_no_acceleration_can_lower_is_infeasible() -> None:

@@ -15,7 +15,9 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.verify.world import World
 
 Array = NDArray[np.float64]
-MARGIN = 1e-5  # relative to the bound, or absolute: a motion need not begin and end more exactly
+# Relative to the bound, or absolute, by the derivative that a condition needs: more than it can change within what the
+# verdict lets boundary conditions be missed by, 1e-6 rad, 1e-6 rad/s and 1e-4 rad/s^2.
+MARGIN = (1e-5, 1e-5, 1e-3)
 
 
 def end_mistakes(
@@ -60,7 +62,7 @@ def _broken(constraint: Constraint, condition: Condition, start_tip: Array, end:
     excess = np.maximum(condition.lower - g, g - condition.upper) - wider
     allowed = constraint.allowed(condition)
     worst = int(np.argmax(excess - allowed))
-    if excess[worst] > allowed[worst] + MARGIN * max(1.0, abs(bound[worst])):
+    if excess[worst] > allowed[worst] + MARGIN[condition.needs] * max(1.0, abs(bound[worst])):
         unit = "" if condition.unit == "1" else f" {condition.unit}"
         yield (
             f"at the {end} {condition.name} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"
@@ -77,7 +79,7 @@ def _has_acceleration(problem: Problem, robot: Robot, q: Array, dq: Array) -> bo
     if not torque:
         return True
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
-    limit = robot.torque_limit * (1 + min(each.tolerance for each in torque))
+    limit = robot.torque_limit * (1 + min(each.tolerance for each in torque) + MARGIN[2]) + MARGIN[2]
     data = robot.model.createData()
     bias = np.array(pin.rnea(robot.model, data, q, dq, np.zeros(robot.n)))
     inertia = np.array([pin.rnea(robot.model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]).T

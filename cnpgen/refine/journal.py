@@ -20,6 +20,7 @@ from cnpgen.wording import counted
 
 MAGIC = b"cnpgen journal 1\n"
 _DIGEST = hashlib.sha256().digest_size
+_MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # nothing is emptied before it is locked
 
 
 @dataclass
@@ -72,7 +73,7 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
         MachineError: The file cannot be opened.
     """
     try:
-        file = open(path, "r+b", opener=_make)  # noqa: PTH123 - only this one takes an opener
+        file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")
     except OSError as error:
         raise MachineError(f"{path}: {error.strerror or error}") from error
     try:
@@ -83,11 +84,6 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
     except BaseException:
         file.close()
         raise
-
-
-def _make(path: str, flags: int) -> int:
-    """Open a file, made if it is missing: what is in it is not touched before it is locked."""
-    return os.open(path, flags | os.O_CREAT, 0o666)
 
 
 def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Journal:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-MARGIN = 1e-4  # rad, for what happens between the moments that the verdict looks at
+MARGIN = 1e-4  # rad, for what happens between the moments that the verdict looks at, and how exactly it begins
 
 
 class Kind(StrEnum):
@@ -117,7 +117,7 @@ def _cannot_brake(problem: "Problem", robot: "Robot", boundary: Boundary) -> Ite
             lower, upper = departure.box(float(time), limits)
             for joint in np.flatnonzero(lower > upper + MARGIN):
                 what, name = _moment(end, float(time)), robot.joint_names[joint]
-                over = float(lower[joint] - upper[joint])
+                over = float(lower[joint] - upper[joint]) - MARGIN
                 yield f"{what} {name} is {over:.2g} rad or more outside its range, however it is accelerated"
 
 

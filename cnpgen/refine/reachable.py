@@ -13,7 +13,7 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 NONE = 1e6  # stands for a limit that the problem does not set
 STEP = 1e-3  # s, of the search for the shortest duration
-TIMES = np.arange(0.01, 0.151, 0.01)  # s from an end: later, intervals are too wide to prove anything
+LOOKS = np.arange(10, 151, 10)  # steps from an end: later, intervals are too wide to prove anything
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,12 @@ def departures(boundary: Boundary) -> dict[str, Departure]:
 def moments(boundary: Boundary, limits: JointLimits) -> Array:
     """Return times from either end [s] at which no motion between the two ends can be over already."""
     start, goal = departures(boundary).values()
-    shortest = float(TIMES[-1])
-    for time in np.arange(STEP, shortest, STEP):
-        if all(_reaches(one, other.q, float(time), limits) for one, other in ((start, goal), (goal, start))):
-            shortest = float(time) - STEP
-            break
-    return TIMES[shortest >= TIMES]
+    pairs = (start, goal), (goal, start)
+    over = next(
+        (k for k in range(1, LOOKS[-1] + 1) if all(_reaches(one, other.q, k * STEP, limits) for one, other in pairs)),
+        LOOKS[-1] + 1,
+    )
+    return np.asarray(STEP * LOOKS[over > LOOKS])
 
 
 def _reaches(departure: Departure, q: Array, time: float, limits: JointLimits) -> bool:
