@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points
 EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exceed within the tolerances
+SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class BoundsTemplate:
             (constraint, condition) for constraint in problem.constraint for condition in constraint.measured(world)
         ]
         tables = [_bounds(constraint, condition, s, tightening) for constraint, condition in pairs]
-        self._s = s
+        self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._pairs = pairs
@@ -117,7 +118,7 @@ class BoundsTemplate:
         column = 0
         for constraint, condition in self._pairs:
             width = len(condition.g)
-            wider = constraint.funnel(condition, self._s, start_tip)
+            wider = constraint.funnel(condition, self._funnelled, start_tip)
             if np.any(wider > 0):
                 scale = _scale(constraint, condition)
                 lower, upper = lower.copy("F"), upper.copy("F")
