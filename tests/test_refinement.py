@@ -175,7 +175,7 @@ def test_ctrl_c_while_problems_are_explained_loses_nothing(
         raise KeyboardInterrupt
 
     problem, out = draw_problems("airhockey-hit", 1), tmp_path / "out.h5"
-    fast = replace(problem.boundary, goal_dq=9.0 * problem.boundary.goal_dq)
+    fast = replace(problem.boundary, goal_dq=30.0 * problem.boundary.goal_dq)
     save_plans(tmp_path / "hard.h5", replace(problem, boundary=fast))
     command = ["refine", str(tmp_path / "hard.h5"), "-o", str(out), "--explain"]
     with monkeypatch.context() as patch:

@@ -17,7 +17,6 @@ USED = 1e-3  # its slope where nothing is violated
 MULTIPLIER = 1e-9  # smaller ones belong to residuals that are not active
 FEASIBLE = 1e-6  # of DAQP
 CHANGES = 3000  # largest number of working-set changes
-STEEPEST = 1e8  # curvature beyond which DAQP may never end; that of problems with a plan stays below 1e5
 ACTIVE = 3e-3  # residuals this close to a bound are held at every grid point
 LOWER, UPPER = 3, 1  # how DAQP is told what is active
 
@@ -79,8 +78,6 @@ class Model:
             before = warm[k, which]
             sense[self.motion.nx + 1 :] = np.select([before > MULTIPLIER, before < -MULTIPLIER], [UPPER, LOWER], 0)
         hessian, linear = self._objective()
-        if not np.abs(hessian).max() < STEEPEST:
-            return None
         solution, _, flag, info = daqp.solve(
             hessian,
             linear,

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 SLOWEST = 60.0  # s: a plan that takes longer is no start
 LOWEST_RATE = 1e-3  # of a plan's largest rate control point
-LOST = 10.0  # boundary states further outside, in scaled units, are no problem that steps could solve
+LOST = 10.0  # boundary states further outside, in scaled units, are no problem for steps; DAQP may take hours over them
 EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the ends need the later one
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 
