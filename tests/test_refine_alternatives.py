@@ -83,7 +83,8 @@ def test_casadis_solvers_end_at_least_as_good_as_the_own_one(solver: str) -> Non
     own = tool.minimise(asked, which, tool._straight(asked))
     motion, bounds = tool.transcription(asked, which), tool._bounds[which].of(asked.start_xyz)
     other = minimise_with(motion, bounds, tool._straight(asked), Settings(), solver=solver)
-    assert bounds.violation(motion.value(other.x)[1]) == other.violation < Settings().violation_tolerance
+    assert bounds.violation(motion.value(other.x)[1]) == pytest.approx(other.violation, abs=1e-12)  # another kernel
+    assert other.violation < Settings().violation_tolerance
     assert other.cost < own.cost * 1.001
     assert 1 < other.iterations <= 6 * Settings().max_iterations
 
