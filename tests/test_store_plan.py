@@ -87,6 +87,11 @@ def test_default_shard_sizes_are_powers_of_two_within_bounds(rows: int, size: in
     assert default_shard_size(rows) == size
 
 
+@pytest.mark.parametrize(("rows", "size"), [(1, 64), (300, 64), (5000, 256), (120_000, 1024)])
+def test_shards_of_slow_rows_are_small_so_that_interruptions_lose_little(rows: int, size: int) -> None:
+    assert default_shard_size(rows, block_rows=64) == size
+
+
 def test_120000_rows_make_15_shards() -> None:
     splits = {"train": 112_000, "validation": 8_000}
     assert len(shards(replace(PLAN, splits=splits, shard_size=default_shard_size(120_000), block_rows=4096))) == 15

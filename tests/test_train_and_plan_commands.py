@@ -54,6 +54,13 @@ def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tm
     assert training["dataset"]["rows"] == {"train": 600, "validation": 60}
 
 
+@pytest.mark.parametrize("often", [0, 100])
+def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):
+    monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
+    assert main(["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]) == 0
+    assert ("a planner from more rows is better" in capsys.readouterr().err) == (often == 0)
+
+
 def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
     words, before = ["train", str(tiny("airhockey-hit")), "-o", str(trained)], trained.read_bytes()
     assert main([*words, *SMALL]) == 0

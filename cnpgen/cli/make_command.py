@@ -47,7 +47,7 @@ def add(commands: "Commands[Parser]") -> None:
         "--shard-size",
         metavar="R",
         type=values.positive,
-        help="rows per file; default 8192 to 65536, with --certify 512 to 1024",
+        help="rows per file; default 8192 to 65536, with --certify 64 to 1024",
     )
     option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
     option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from cnpgen.training.train import Trained
 
 
+OFTEN = 100  # passes over the same rows after which more rows help more
+
+
 class Watch:
     """Shows how training goes."""
 
@@ -26,6 +29,9 @@ class Watch:
         self._last = step
         parameters = run.learner.architecture.n_parameters
         self._meter.begin(f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step)
+        passes = steps * run.learner.settings.batch_size / len(run.rows)
+        if passes > OFTEN and not self._quiet:
+            print(f"every row is seen {passes:,.0f} times: a planner from more rows is better", file=sys.stderr)
 
     def __call__(self, record: Mapping[str, Any]) -> None:
         """Show a line of the log."""

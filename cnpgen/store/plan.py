@@ -140,14 +140,14 @@ def _check_names(plan: DatasetPlan) -> None:
 def default_shard_size(rows: int, block_rows: int = 4096) -> int:
     """Choose the rows per shard: about 16 shards, but between 8192 and 65536 rows, a power of two.
 
-    Where blocks are smaller than 4096 rows, since every row takes long, shards have 8 to 16 blocks: what is lost when a
-    worker is killed is less than a shard.
+    Where blocks are smaller than 4096 rows, since every row takes long, shards have 1 to 16 blocks: an interruption
+    loses what was not finished of a shard.
 
     Args:
         rows: Rows of the whole dataset.
         block_rows: Rows per block.
     """
-    low, high = (8192, 65536) if block_rows >= 4096 else (8 * block_rows, 16 * block_rows)
+    low, high = (8192, 65536) if block_rows >= 4096 else (block_rows, 16 * block_rows)
     return int(min(max(1 << max(round(math.log2(max(rows, 1) / 16)), 0), low), high))
 
 
