@@ -68,7 +68,8 @@ def read_rows(
     rows = dataset.plan.splits[split]
     stop = rows if n is None else first + n
     if not 0 <= first < stop <= rows:
-        raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {max(stop - first, 1)} from row {first} on")
+        wanted = f"{max(stop - first, 1)} from row {first} on"
+        raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {wanted}")
     known = {each.name for each in dataset.plan.fields}
     names = [name for name in (*BOUNDARY, "sample_id", *CONTEXT) if name in known]
     found = dataset.read(split, fields=names, start=first, stop=stop)
