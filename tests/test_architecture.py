@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
 # Layers from the top of docs/architecture.md downwards; a module may import those of its own layer and above.
 LAYERS = (
-    ("errors", "units", "fields", "outcome", "wording", "threads", "arguments"),
+    ("errors", "units", "fields", "outcome", "wording", "threads", "arguments", "signals"),
     ("workers",),
     ("schema", "parsing"),
     ("constraints", "pipelines.stage"),

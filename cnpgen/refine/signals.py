@@ -1,10 +1,10 @@
 """Signals while a library runs that asks Python for them and drops what their handlers raise, as CasADi does."""
 
-import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+from cnpgen.signals import Handler, signals_noted
 
 Received = list[tuple[int, FrameType | None]]
 
@@ -17,20 +17,10 @@ def signals_held_back() -> Iterator[Received]:
         What has come so far: whoever is called back in the block looks whether it is to end.
     """
     received: Received = []
-    before = {}
-    if threading.current_thread() is threading.main_thread():  # no other may set handlers
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        before = {number: handler for number, handler in handlers.items() if callable(handler)}
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append((number, frame))
-
-    for number in before:
-        signal.signal(number, note)
+    before: dict[int, Handler] = {}
     try:
-        yield received
+        with signals_noted(lambda number, frame: received.append((number, frame))) as before:
+            yield received
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         for first, frame in received[:1]:
-            before[signal.Signals(first)](first, frame)
+            before[first](first, frame)

@@ -1,12 +1,13 @@
 """Signals that wait: a step is finished and the run saved before Ctrl-C or SIGTERM does what it does."""
 
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+
+from cnpgen.signals import signals_noted
 
 ECHO_SECONDS = 1.0  # a terminal and a wrapper such as ``uv run`` both pass on the same Ctrl-C
 
@@ -32,24 +33,14 @@ def signals_wait() -> Iterator[Waiting]:
     stay as they are, and so do all of them outside of the main thread.
     """
     waiting = Waiting()
-    if threading.current_thread() is not threading.main_thread():
-        yield waiting
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in before.items() if callable(handler)}
 
     def note(number: int, frame: FrameType | None) -> None:
         if waiting.number is None:
             waiting.number, waiting.since = number, time.monotonic()
         elif time.monotonic() - waiting.since > ECHO_SECONDS:
-            handlers[signal.Signals(number)](number, frame)
+            handlers[number](number, frame)
 
-    for number in handlers:
-        signal.signal(number, note)
-    try:
+    with signals_noted(note) as handlers:
         yield waiting
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
     if waiting.number is not None:
         signal.raise_signal(waiting.number)
