@@ -7,9 +7,7 @@ from cnpgen.schema import Range, field
 
 
 @dataclass(frozen=True, kw_only=True)
-class Roll(Stage):
-    size: Range = field("size of the die", unit="m")
-
+class Idle(Stage):
     def describe(self):
         return "roll"
 
@@ -18,3 +16,8 @@ class Roll(Stage):
 
     def prepare(self, context):
         return lambda batch, random: None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roll(Idle):
+    size: Range = field("size of the die", unit="m")

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
+from example_stages import Idle
 
 from cnpgen import plugins
 from cnpgen.constraints.constraint import Constraint
@@ -14,17 +15,8 @@ from cnpgen.schema import field
 
 
 @dataclass(frozen=True, kw_only=True)
-class Roll(Stage):
+class Roll(Idle):
     sides: int = field("sides of the die", default=6)
-
-    def describe(self):
-        return "roll"
-
-    def provides(self, context):
-        return ()
-
-    def prepare(self, context):
-        return lambda batch, random: None
 
 
 class NotADataclass(Roll):

@@ -156,12 +156,14 @@ class Refiner:
         x = repaired.x if repaired is not None and usable else self._straight(task)
         best = self._attempt(task, self.passes.first, x, Outcome.SOLVED, warm=usable)
         yield best
-        for which in (self.passes.polish, self.passes.strict):
-            polished = self._attempt(task, which, best.x, Outcome.POLISHED, warm=True)
-            yield polished
-            if which is self.passes.polish and repaired is not None and repaired.outcome is Outcome.SLOWED:
-                yield repaired
-            best = polished if polished.is_better(best) else best
+        polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
+        yield polished
+        if repaired is not None and repaired.outcome is Outcome.SLOWED and repaired.excess <= 1:
+            yield repaired
+        best = polished if polished.is_better(best) else best
+        strict = self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED, warm=True)
+        yield strict
+        best = strict if strict.is_better(best) else best
         for start in self._other_starts(task):
             other = self._attempt(task, self.passes.other, _variables(start), Outcome.RESTARTED)
             yield other
