@@ -93,7 +93,8 @@ def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
 
 def _requests(arguments: argparse.Namespace, planner: "Planner") -> "Requests":
     from cnpgen.errors import UsageError
-    from cnpgen.planner.requests import read_file, read_rows
+    from cnpgen.planner.request_files import read_file
+    from cnpgen.planner.requests import read_rows
 
     if arguments.problems.is_dir():
         return read_rows(
@@ -104,6 +105,6 @@ def _requests(arguments: argparse.Namespace, planner: "Planner") -> "Requests":
             n=arguments.n,
             other=arguments.other_rows,
         )
-    if arguments.split is not None or arguments.first is not None or arguments.n is not None or arguments.other_rows:
-        raise UsageError("--split, --first, --n and --other-rows are for the folder of a dataset, got a file")
-    return read_file(arguments.problems, planner.model)
+    if arguments.split is not None or arguments.first is not None or arguments.n is not None:
+        raise UsageError("--split, --first and --n are for the folder of a dataset, got a file")
+    return read_file(arguments.problems, planner.model, other=arguments.other_rows)

@@ -1,4 +1,4 @@
-"""What is to be planned: rows of a dataset, or a file of boundary conditions; checked against what a model can do."""
+"""What is to be planned: rows of a dataset, checked against what a model can do."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -15,8 +15,6 @@ from cnpgen.planner.model import Model
 from cnpgen.plans.layout import BOUNDARY
 from cnpgen.plans.problem import ProblemRecord
 from cnpgen.store.documents import canonical_sha256
-from cnpgen.store.heaps import opened_foreign_hdf5
-from cnpgen.store.places import require_file
 from cnpgen.store.plan import DatasetPlan
 from cnpgen.store.reader import open_dataset
 from cnpgen.trajectory.boundary import Boundary
@@ -25,6 +23,7 @@ Array = NDArray[np.float64]
 
 CERTIFIED = "certified-plan"  # the stage that plans every sample
 CONTEXT = ("hit_angle", "hit_speed")  # columns of a dataset that plans keep
+ASKED = (*BOUNDARY, "goal_ddq", "sample_id", *CONTEXT)
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,7 @@ def read_rows(
         UsageError: There are no such rows.
     """
     dataset = open_dataset(folder)
-    _check_problem(str(folder), problem_of(dataset.plan), model)
-    if not other:
-        _check_stages(folder, dataset.plan, model)
+    check_drawing(str(folder), dataset.plan, model, other=other)
     if split not in dataset.plan.splits:
         raise UsageError(f"{folder} has no split {split!r}{nearest(split, dataset.plan.splits)}")
     rows = dataset.plan.splits[split]
@@ -71,40 +68,11 @@ def read_rows(
         wanted = f"{max(stop - first, 1)} from row {first} on"
         raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {wanted}")
     known = {each.name for each in dataset.plan.fields}
-    names = [name for name in (*BOUNDARY, "sample_id", *CONTEXT) if name in known]
+    names = [name for name in ASKED if name in known]
     found = dataset.read(split, fields=names, start=first, stop=stop)
     columns = {name: np.asarray(found[name], np.float64) for name in CONTEXT if name in found}
-    boundary = _boundary(str(folder), found, model)
+    boundary = boundary_in(str(folder), found, model)
     return Requests(boundary, found.get("sample_id", np.arange(first, stop)), columns)
-
-
-def read_file(path: Path, model: Model) -> Requests:
-    """Read boundary conditions from an HDF5 file: a shard, a file of plans, or one that holds nothing else.
-
-    Args:
-        path: The file, with datasets ``start_q`` and ``goal_q`` of shape (N, n), and ``start_dq``, ``start_ddq`` and
-            ``goal_dq`` where they are not zero.
-        model: What will plan for them.
-
-    Raises:
-        UsageError: There is no such file.
-        DatasetError: The file is damaged, lacks something, or says that it is of another problem.
-    """
-    require_file(path, "a dataset or an HDF5 file of boundary conditions")
-    with opened_foreign_hdf5(path) as file:
-        digest = file.attrs.get("problem_sha256")
-        found = {name: np.asarray(file[name][()]) for name in (*BOUNDARY, "sample_id") if name in file}
-    if isinstance(digest, bytes | str):
-        said = digest.decode(errors="replace") if isinstance(digest, bytes) else digest
-        if said != model.problem.digest:
-            raise DatasetError(f"{path} is of another problem than the model, which plans for {model.problem.name!r}")
-    missing = [name for name in ("start_q", "goal_q") if name not in found]
-    if missing:
-        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan")
-    boundary = _boundary(str(path), found, model)
-    ids = found.get("sample_id")
-    usable = ids is not None and ids.shape == (len(boundary),) and ids.dtype.kind in "iu"
-    return Requests(boundary, ids.astype(np.int64) if usable and ids is not None else np.arange(len(boundary)))
 
 
 def problem_of(plan: DatasetPlan) -> ProblemRecord:
@@ -112,21 +80,23 @@ def problem_of(plan: DatasetPlan) -> ProblemRecord:
     return ProblemRecord(json.dumps(plan.recipe["pipeline"]["problem"], ensure_ascii=False), str(plan.robot["urdf"]))
 
 
-def _boundary(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
+def boundary_in(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
+    """Take the boundary conditions out of named columns; what is missing is zero.
+
+    Raises:
+        DatasetError: A shape is wrong, something is not finite, or goal accelerations are prescribed.
+    """
+    if "goal_ddq" in found:
+        raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
     try:
-        return boundary_of(
-            len(model.problem.joint_names),
-            found["start_q"],
-            found.get("start_dq"),
-            found.get("start_ddq"),
-            found["goal_q"],
-            found.get("goal_dq"),
-        )
+        given = (found.get(name) for name in BOUNDARY)
+        return boundary_of(len(model.problem.joint_names), *given)  # type: ignore[arg-type]
     except UsageError as error:
         raise DatasetError(f"{where}: {error}") from error
 
 
-def _check_problem(where: str, found: ProblemRecord, model: Model) -> None:
+def check_problem(where: str, found: ProblemRecord, model: Model) -> None:
+    """Refuse what is of another problem than the model."""
     if found.digest != model.problem.digest:
         differs = ", ".join(found.differences(model.problem)[:4])
         raise DatasetError(
@@ -139,13 +109,14 @@ def _drawing(stages: Iterable[Mapping[str, Any]]) -> str:
     return canonical_sha256([stage for stage in stages if stage.get("use") != CERTIFIED])
 
 
-def _check_stages(folder: Path, plan: DatasetPlan, model: Model) -> None:
-    """Refuse rows that are drawn in another way than the training rows."""
+def check_drawing(where: str, plan: DatasetPlan, model: Model, *, other: bool) -> None:
+    """Refuse rows of another problem, and if not ``other`` those drawn in another way than the training rows."""
+    check_problem(where, problem_of(plan), model)
     trained = model.training.get("stages")
-    if trained is None or _drawing(trained) == _drawing(plan.recipe["pipeline"]["stage"]):
+    if other or trained is None or _drawing(trained) == _drawing(plan.recipe["pipeline"]["stage"]):
         return
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(
-        f"the rows of {folder} are drawn in another way than those of {name!r} that the model was trained on: the"
+        f"the rows of {where} are drawn in another way than those of {name!r} that the model was trained on: the"
         " recipe has changed since, or it is another one; --other-rows plans for them all the same"
     )

@@ -114,24 +114,36 @@ def _number(path: Path, attributes: Mapping[str, Any], name: str, default: int) 
 
 def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | None) -> ProblemRecord:
     """Find out which problem the plans are for."""
-    if "problem_recipe" in attributes:
-        found = _stored_record(path, attributes)
-    elif "problem" in attributes:
-        name = _text(path, attributes, "problem")
-        try:
-            found = record_problem(load_problem(name, relative_to=path.parent))
-        except RecipeError as error:
-            raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
-    elif wanted is None:
+    found = stored_problem(path, attributes) or wanted
+    if found is None:
         raise DatasetError(f"{path} does not say its problem: set the attribute 'problem', or pass problem=...")
-    else:
-        return wanted
     if wanted is not None and found.digest != wanted.digest:
         where = ", ".join(found.differences(wanted)[:4])
         raise DatasetError(
             f"{path} has plans of problem {found.name!r}, not of {wanted.name!r}: they differ in {where}"
         )
     return wanted or found
+
+
+def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord | None:
+    """Return the problem that a file says it is of; None if it says none.
+
+    Args:
+        path: The file.
+        attributes: Its attributes ``problem``, ``problem_recipe``, ``problem_urdf`` and ``problem_sha256``.
+
+    Raises:
+        DatasetError: It says one that is damaged or cannot be found.
+    """
+    if "problem_recipe" in attributes:
+        return _stored_record(path, attributes)
+    if "problem" not in attributes:
+        return None
+    name = _text(path, attributes, "problem")
+    try:
+        return record_problem(load_problem(name, relative_to=path.parent))
+    except RecipeError as error:
+        raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
 
 
 def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
