@@ -1,5 +1,6 @@
 """The planner: boundary conditions to rounding, one or many, replanning without a jump, errors that say why."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -90,6 +91,49 @@ def test_a_feint_and_then_a_strike_is_one_continuous_motion(planner, rows):
         q1, dq1, ddq1 = states_at(new, h)
         np.testing.assert_allclose((q1 - q0) / (2 * h), (dq0 + dq1) / 2, atol=1e-4)
         np.testing.assert_allclose((dq1 - dq0) / (2 * h), (ddq0 + ddq1) / 2, atol=1e-2)
+
+
+def test_the_order_of_the_paper_is_that_of_positional_arguments(planner, rows):
+    ends = (rows.start_q, rows.start_dq, rows.start_ddq, rows.goal_q, rows.goal_dq)
+    np.testing.assert_array_equal(planner.plan(*ends).path_control_points, planned(planner, rows).path_control_points)
+    with pytest.raises(UsageError, match="goal_q is missing"):
+        planner.plan(rows.start_q)
+
+
+def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(tiny):
+    """A plan's own start and end are off zero by 1e-14: replan(plan, 0) and chains of plans must not fail by it."""
+    rest = boundary_of_columns(columns_of(tiny("heavy-object")), 20)
+    planner = Planner(untrained_model("heavy-object", rest))
+    plans = planned(planner, rest)
+    assert np.abs(states_at(plans, 0.0)[2]).max() > 0
+    again = planner.replan(plans, 0.0, goal_q=rest.goal_q)
+    np.testing.assert_array_equal(again.boundary.start_ddq, 0.0)
+    np.testing.assert_allclose(again.path_control_points, plans.path_control_points, atol=1e-5)
+    limit = planner.robot.velocity_limit
+    planner.plan(rest.start_q, 0.9e-9 * limit, goal_q=rest.goal_q)
+    with pytest.raises(UsageError, match="start_dq was zero"):
+        planner.plan(rest.start_q, 1.1e-9 * limit, goal_q=rest.goal_q)
+    q, dq, _ = states_at(plans, plans.duration)
+    np.testing.assert_allclose(planner.plan(q, dq, goal_q=rest.start_q).boundary.start_dq, 0.0, atol=0)
+
+
+def test_a_planner_goes_to_other_processes_without_its_kernels(planner, rows):
+    other = pickle.loads(pickle.dumps(Planner(planner.model, slow_down=False, backend="numpy")))
+    found = planned(other, rows).path_control_points
+    np.testing.assert_allclose(found, planned(planner, rows).path_control_points, atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
+def test_what_is_no_model_is_refused_by_its_value(wrong):
+    with pytest.raises(UsageError, match=f"a model is a name or a path, got {wrong!r}"):
+        Planner(wrong)
+
+
+@pytest.mark.parametrize("time", [[0.1, 0.2], "soon", [[0.1]] * 3])
+def test_times_that_are_not_one_for_every_plan_are_refused(planner, rows, time):
+    one = planned(planner, rows[:1])
+    with pytest.raises(UsageError, match="time must be one number or one for each of 1 plans, got"):
+        planner.replan(one, time, goal_q=rows.goal_q[0])
 
 
 def test_a_moment_outside_of_the_plan_is_refused(planner, rows):

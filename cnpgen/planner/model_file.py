@@ -61,6 +61,8 @@ def find_model(name_or_path: str | Path) -> Path:
     Raises:
         UsageError: There is no shipped model of this name.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise UsageError(f"a model is a name or a path, got {name_or_path!r}")
     text, known = os.fspath(name_or_path), shipped_models()
     if isinstance(name_or_path, Path) or text.endswith(".h5") or os.sep in text or Path(text).is_file():
         return Path(text)

@@ -1,7 +1,10 @@
 """The planner: boundary conditions in, plans out, in a fraction of a millisecond; replanning on the fly."""
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +18,8 @@ from cnpgen.plans.plans import Plans
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
+
+AT_REST = 1e-9  # of a limit: what rounding leaves of a velocity or an acceleration that was zero
 
 
 class Planner:
@@ -36,7 +41,7 @@ class Planner:
 
     def __init__(self, model: Model | str | Path, *, slow_down: bool = True, backend: str | None = None) -> None:
         self.model = model if isinstance(model, Model) else load_model(model)
-        slow_down = slow_down and self.model.rests
+        self._options: dict[str, Any] = {"slow_down": slow_down, "backend": backend}
         with surroundings(self.model.problem, backend) as given:
             self.robot = given.robot
             meaning = self.model.meaning
@@ -44,16 +49,22 @@ class Planner:
                 given,
                 bending_steps=meaning.bending_steps,
                 landing_steps=meaning.landing_steps,
-                slow_down=slow_down,
+                slow_down=slow_down and self.model.rests,
             )
+            velocity, acceleration = given.robot.velocity_limit, given.robot.acceleration_limit
+            self._still = {"start_dq": AT_REST * velocity, "start_ddq": AT_REST * acceleration}
+            self._still["goal_dq"] = self._still["start_dq"]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle without kernels: they are loaded anew where the planner goes."""
+        return partial(type(self), **self._options), (self.model,)
 
     def plan(
         self,
         start_q: ArrayLike,
         start_dq: ArrayLike | None = None,
         start_ddq: ArrayLike | None = None,
-        *,
-        goal_q: ArrayLike,
+        goal_q: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding, whatever the network gives.
@@ -62,16 +73,18 @@ class Planner:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
             start_dq: Start velocities [rad/s]; at rest by default.
             start_ddq: Start accelerations [rad/s^2]; none by default.
-            goal_q: Goal positions [rad].
+            goal_q: Goal positions [rad]; they must be given.
             goal_dq: Goal velocities [rad/s]; at rest by default.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
 
         Raises:
-            UsageError: A shape is wrong, something is not finite, or something moves that was at rest in every row that
-                the model was trained on.
+            UsageError: A shape is wrong, something is missing or not finite, or something moves that was at rest in
+                every row that the model was trained on.
         """
+        if goal_q is None:
+            raise UsageError("goal_q is missing: plan(start_q, start_dq, start_ddq, goal_q, goal_dq)")
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
 
     def plan_batch(
@@ -93,11 +106,13 @@ class Planner:
         """
         if boundary.goal_ddq is not None:
             raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
-        self._check_rest(boundary)
-        return self._kit.plan(self.model, boundary, sample_id=sample_id, columns=columns)
+        return self._kit.plan(self.model, self._rested(boundary), sample_id=sample_id, columns=columns)
 
     def replan(self, plans: Plans, time: ArrayLike, *, goal_q: ArrayLike, goal_dq: ArrayLike | None = None) -> Plans:
         """Plan on from points on plans that are being executed: q, dq and ddq go on without a jump.
+
+        At its very end a plan may still accelerate, because goal accelerations are free. What follows a motion that
+        ends at rest begins at rest: ``plan`` from its goal.
 
         Args:
             plans: One plan or N, by any planner of the same robot.
@@ -107,20 +122,27 @@ class Planner:
             goal_dq: New goal velocities [rad/s]; at rest by default.
 
         Raises:
-            UsageError: A time is not within its plan, or as for ``plan``.
+            UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
         """
         q, dq, ddq = states_at(plans, time)
         return self.plan(q, dq, ddq, goal_q=goal_q, goal_dq=goal_dq)
 
-    def _check_rest(self, boundary: Boundary) -> None:
+    def _rested(self, boundary: Boundary) -> Boundary:
+        """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""
+        still = {}
         for name in self.model.rest:
-            if getattr(boundary, name).any():
-                moving = np.abs(getattr(boundary, name)).max(axis=1)
-                row = int(moving.argmax())
+            values = getattr(boundary, name)
+            if not values.any():
+                continue
+            moving = np.abs(values).max(axis=1)
+            row = int(moving.argmax())
+            if (np.abs(values) > self._still[name]).any():
                 raise UsageError(
                     f"{name} was zero in every row that the model was trained on, got {moving[row]:g} in plan {row}:"
                     " train on such rows, or use a model that was"
                 )
+            still[name] = np.zeros_like(values)
+        return replace(boundary, **still) if still else boundary
 
 
 def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
@@ -134,9 +156,12 @@ def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
         Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
 
     Raises:
-        UsageError: A time is not within its plan.
+        UsageError: There are not as many times as plans, or one is not within its plan.
     """
-    times = np.broadcast_to(np.asarray(time, np.float64), (len(plans),))
+    try:
+        times = np.broadcast_to(np.asarray(time, np.float64), (len(plans),))
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"time must be one number or one for each of {len(plans)} plans, got {time!r}") from error
     outside = ~((times >= 0) & (times <= plans.duration))
     if outside.any():
         row = int(outside.argmax())
