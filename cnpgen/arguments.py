@@ -1,7 +1,10 @@
-"""What functions are given from Python: numbers that must be whole, within bounds."""
+"""What functions are given from Python: whole numbers within bounds, finite numbers, yes or no."""
 
+import math
 import operator
 from typing import Any
+
+import numpy as np
 
 from cnpgen.errors import UsageError
 
@@ -26,3 +29,30 @@ def integer(name: str, value: Any, *, least: int, most: int | None = None) -> in
         bounds = f"from {least} on" if most is None else f"from {least} to {most}"
         raise UsageError(f"{name} must be an integer {bounds}, got {value!r}")
     return found
+
+
+def number(name: str, value: Any) -> float:
+    """Return an argument as a float; any library's real numbers are some, texts, True, arrays and nan are none.
+
+    Raises:
+        UsageError: It is none, or not finite.
+    """
+    try:
+        real = not isinstance(value, str | bytes | bool | np.bool_ | np.complexfloating) and np.ndim(value) == 0
+        found = float(value) if real else math.nan
+    except (TypeError, ValueError):
+        found = math.nan
+    if not math.isfinite(found):
+        raise UsageError(f"{name} must be a finite number, got {value!r:.100}")
+    return found
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return an argument that must be True or False; NumPy's are some, 1 and "no" are none.
+
+    Raises:
+        UsageError: It is neither.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise UsageError(f"{name} must be True or False, got {value!r:.100}")
+    return bool(value)

@@ -9,7 +9,7 @@ import pytest
 from conftest import tiny_recipe
 from tiny_datasets import make_tiny
 
-from cnpgen.arguments import integer
+from cnpgen.arguments import flag, integer, number
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.library import dataset_recipe_of, load_pipeline
 from cnpgen.make import make_dataset
@@ -28,6 +28,25 @@ def test_integers_of_numpy_are_integers(value: Any) -> None:
 def test_what_is_no_integer_or_beyond_its_bounds_is_refused_with_the_bounds(value: object) -> None:
     with pytest.raises(UsageError, match=r"^n must be an integer from 3 to 7, got "):
         integer("n", value, least=3, most=7)
+
+
+@pytest.mark.parametrize("value", [0.5, np.float32(0.5), np.array(0.5)])
+def test_numbers_of_numpy_are_numbers(value: Any) -> None:
+    found = number("x", value)
+    assert (found, type(found)) == (0.5, float)
+
+
+@pytest.mark.parametrize("value", ["0.5", None, True, np.nan, np.inf, 1j, np.complex128(1), [0.5], np.array([0.5])])
+def test_what_is_no_finite_number_is_refused(value: object) -> None:
+    with pytest.raises(UsageError, match=r"^x must be a finite number, got "):
+        number("x", value)
+
+
+def test_yes_and_no_are_booleans_and_nothing_else() -> None:
+    assert flag("on", True) is flag("on", np.bool_(True)) is True
+    for value in (1, "no", None, [True]):
+        with pytest.raises(UsageError, match=r"^on must be True or False, got "):
+            flag("on", value)
 
 
 WRONG: dict[str, list[Any]] = {

@@ -54,12 +54,13 @@ def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, An
         split = str(random.choice(list(dataset.splits)))
         rows, world = dataset.splits[split], int(random.integers(1, 5))
         batch_size = world * int(random.integers(1, 2 * rows // world + 2))
+        drop_last = bool(random.integers(2)) and batch_size <= rows
         yield (
             split,
             {
                 "batch_size": batch_size,
-                "world": world,
-                "drop_last": bool(random.integers(2)) and batch_size <= rows,
+                "world": 1 if not drop_last and 0 < rows % batch_size < world else world,  # refused, see below
+                "drop_last": drop_last,
                 "seed": int(random.integers(5)),
                 "epoch": int(random.integers(3)),
                 "shuffle": bool(random.integers(4)),
@@ -252,11 +253,31 @@ def test_float32_shards_are_delivered_too(tmp_path: Path) -> None:
             assert np.array_equal(batch["start_q"], rows["start_q"][batch["sample_id"]])
 
 
+@pytest.mark.parametrize("stored", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_batches_and_rows_are_normalised_to_the_same_bit(tmp_path: Path, stored: str, dtype: str) -> None:
+    dataset = load_dataset(make(tmp_path, dtype=stored))
+    (batch,) = dataset.batches(50, fields=ALL, dtype=dtype)
+    rows = dataset.rows("train", batch["sample_id"], fields=ALL, normalize=True, dtype=dtype)
+    assert all(np.array_equal(rows[name], values) for name, values in batch.items())
+
+
 def test_more_than_all_rows_in_a_batch_are_refused_unless_a_short_one_will_do(plain: Dataset) -> None:
     with pytest.raises(UsageError, match=r"batch_size 51 is more than the 50 rows of split 'train'; drop_last=False"):
         plain.batches(51)
     (batch,) = plain.batches(51, drop_last=False)
     assert batch.rows == 50
+
+
+def test_no_rank_gets_a_batch_of_no_rows(plain: Dataset) -> None:
+    message = "the last batch of 50 rows has 2 for 3 ranks: leave it out with drop_last=True"
+    with pytest.raises(UsageError, match=message):
+        plain.batches(6, world=3, drop_last=False)
+    assert [batch.rows for batch in plain.batches(48, world=2, rank=1, drop_last=False)] == [24, 1]
+    batches = plain.batches(9, world=3, drop_last=False)  # 50 = 5 x 9 + 5, but 46 = 5 x 9 + 1
+    with pytest.raises(UsageError, match="has 1 for 3 ranks"):
+        batches.load_state(batches.state() | {"row": 4})
+    assert batches.state()["row"] == 0
 
 
 @pytest.mark.parametrize(
@@ -271,6 +292,10 @@ def test_more_than_all_rows_in_a_batch_are_refused_unless_a_short_one_will_do(pl
         ({"epoch": "1"}, "epoch must be an integer from 0 on, got '1'"),
         ({"dtype": "float16"}, "dtype must be one of float32, float64, got 'float16'"),
         ({"dtype": "flaot32"}, "dtype must be one of float32, float64, got 'flaot32'"),
+        ({"normalize": "yes"}, "normalize must be True, False or the normalization of a dataset, got 'yes'"),
+        ({"normalize": 1}, "normalize must be True, False or the normalization of a dataset, got 1"),
+        ({"shuffle": "no"}, "shuffle must be True or False, got 'no'"),
+        ({"drop_last": 0}, "drop_last must be True or False, got 0"),
         ({"fields": "start_q"}, r"write \['start_q'\]"),
         ({"fields": []}, "one or more different names"),
         ({"fields": ["start_q", "start_q"]}, "one or more different names"),

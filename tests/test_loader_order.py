@@ -56,6 +56,12 @@ def test_a_window_has_about_the_rows_it_should(monkeypatch: pytest.MonkeyPatch) 
     assert [len(Order("train", (16,) * shards, 0, 0).windows) for shards in (1, 4, 5, 6, 7, 8)] == [1, 1, 1, 2, 2, 2]
 
 
+@pytest.mark.parametrize(("rows", "count"), [(393_215, 1), (393_216, 2)])
+def test_a_split_is_shuffled_as_a_whole_up_to_the_size_that_the_docs_say(rows: int, count: int) -> None:
+    shards = (4096,) * (rows // 4096) + ((rows % 4096,) if rows % 4096 else ())
+    assert len(Order("train", shards, 0, 0).windows) == count
+
+
 def test_without_shuffling_rows_come_as_they_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 10)
     found = Order("train", (8, 8, 8), 5, 1, shuffle=False)

@@ -75,6 +75,16 @@ def test_batches_of_shards_that_cannot_be_mapped_are_the_same(tmp_path: Path) ->
     assert np.array_equal(found, expected)
 
 
+def test_as_many_maps_are_kept_as_may_be_and_no_newer_one_is_thrown_out(tmp_path: Path) -> None:
+    dataset, most = load_dataset(make(tmp_path / "set", splits={"train": 40}, shard_size=1)), shards_module.MOST_MAPS
+    shards = dataset.shards["train"]
+    assert len(shards) > most
+    for count, shard in enumerate(shards, 1):
+        dataset.reader.read(shard, FIELDS)
+        assert len(dataset.reader._maps) == min(count, most)
+    assert list(dataset.reader._maps) == [shard.path for shard in shards[-most:]]
+
+
 def test_a_shard_is_checked_once(shard: Shard, monkeypatch: pytest.MonkeyPatch) -> None:
     counted = []
     original = shards_module.file_sha256

@@ -32,7 +32,7 @@ class Batches:
         position: Where to begin.
 
     Raises:
-        UsageError: There are fewer rows than one batch needs.
+        UsageError: There are fewer rows than one batch needs, or in the last batch than there are ranks.
     """
 
     def __init__(self, source: Source, form: Form, cut: Cut, position: Position) -> None:
@@ -41,6 +41,7 @@ class Batches:
                 f"batch_size {cut.batch_size} is more than the {source.rows} rows of split {source.split!r};"
                 " drop_last=False gives them as one batch"
             )
+        cut.check_ranks(source.rows, first=position.row)
         self._source, self._form, self._cut, self._position = source, form, cut, position
         self._kept: Kept | None = None
 
@@ -132,10 +133,12 @@ class Batches:
         a state counts rows, so that it may be loaded with another batch size or number of ranks.
 
         Raises:
-            UsageError: This is not the state of a loader.
+            UsageError: This is not the state of a loader, or from there on the last batch has fewer rows than ranks.
             DatasetError: It is of another dataset or split.
         """
-        self._position = self._forward(position_from_json(state, self._source))
+        position = self._forward(position_from_json(state, self._source))
+        self._cut.check_ranks(self._source.rows, first=position.row)
+        self._position = position
 
     def for_worker(self, worker: int, workers: int) -> "Batches":
         """Return the part of one of several workers, which take the batches from here on in turn."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from cnpgen.arguments import integer
+from cnpgen.arguments import flag, integer
 from cnpgen.errors import UsageError
 
 
@@ -29,6 +29,7 @@ class Cut:
     def __post_init__(self) -> None:
         for name, least in (("batch_size", 1), ("world", 1), ("rank", 0), ("workers", 1), ("worker", 0)):
             object.__setattr__(self, name, integer(name, getattr(self, name), least=least))
+        object.__setattr__(self, "drop_last", flag("drop_last", self.drop_last))
         for name, value, count in (("rank", self.rank, self.world), ("worker", self.worker, self.workers)):
             if value >= count:
                 raise UsageError(f"{name} must be one of 0 to {count - 1}, got {value}")
@@ -41,6 +42,23 @@ class Cut:
     def end(self, rows: int, *, first: int = 0) -> int:
         """Return the position at which the batches from position ``first`` on end, of ``rows`` rows."""
         return rows - (rows - first) % self.batch_size if self.drop_last else rows
+
+    def check_ranks(self, rows: int, *, first: int = 0) -> None:
+        """Refuse a last batch that has no row for some of the ranks: the mean of nothing is nan, and spreads to all.
+
+        Args:
+            rows: Number of rows.
+            first: The position from which on batches are cut.
+
+        Raises:
+            UsageError: There is such a batch.
+        """
+        left = (self.end(rows, first=first) - first) % self.batch_size
+        if 0 < left < self.world:
+            raise UsageError(
+                f"the last batch of {rows} rows has {left} for {self.world} ranks: leave it out with drop_last=True,"
+                " read all of it on every rank (world=1), or choose another batch_size"
+            )
 
     def count(self, rows: int) -> int:
         """Return the number of batches that this worker gets of ``rows`` rows."""

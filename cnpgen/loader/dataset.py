@@ -110,7 +110,8 @@ class Dataset:
             shuffle: Whether to shuffle; else rows come in their stored order.
 
         Raises:
-            UsageError: An argument cannot be meant, or there are fewer rows than one batch needs.
+            UsageError: An argument cannot be meant, or there are fewer rows than one batch needs, or in the last batch
+                than there are ranks.
             DatasetError: There is no such split or field, or nothing to normalise with.
         """
         cut = Cut(batch_size=batch_size, rank=rank, world=world, drop_last=drop_last)

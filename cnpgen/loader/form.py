@@ -35,7 +35,10 @@ class Form:
         Args:
             rows: Field name -> values, shape (k, width) or (k,).
         """
-        found = dict(rows) if self.normalization is None else self.normalization.normalize(rows)
+        found = dict(rows)
+        if self.normalization is not None:  # in float64, as batches are, whatever the rows are stored as
+            found |= {name: found[name].astype(np.float64, copy=False) for name in self.layout.slices}
+            found = self.normalization.normalize(found)
         return found | {name: found[name].astype(self.dtype, copy=False) for name in self.layout.slices}
 
 
@@ -58,18 +61,24 @@ def make_form(
 
     Raises:
         DatasetError: There is no such field, or nothing to normalise it with.
-        UsageError: The names or the type cannot be meant.
+        UsageError: The names, the normalisation or the type cannot be meant.
     """
-    normalization = (own if normalize else None) if isinstance(normalize, bool) else normalize
-    if normalize is True and own is None:
-        raise DatasetError(
-            f"{plan.name} has no training rows to normalise with; pass normalize=False, or the normalization of the"
-            " dataset that the model was trained on"
-        )
+    normalization = normalize if isinstance(normalize, Normalization) else _own(plan, own, normalize)
     layout = select_columns(plan, fields)
     if normalization is not None:
         normalization.side_by_side(layout.floats)  # a missing field is noticed here, not in a thread
     return Form(layout, normalization, _float_dtype(plan.dtype if dtype is None else dtype))
+
+
+def _own(plan: DatasetPlan, own: Normalization | None, normalize: object) -> Normalization | None:
+    if not isinstance(normalize, bool | np.bool_):
+        raise UsageError(f"normalize must be True, False or the normalization of a dataset, got {normalize!r:.100}")
+    if normalize and own is None:
+        raise DatasetError(
+            f"{plan.name} has no training rows to normalise with; pass normalize=False, or the normalization of the"
+            " dataset that the model was trained on"
+        )
+    return own if normalize else None
 
 
 def _float_dtype(dtype: DTypeLike) -> np.dtype[Any]:

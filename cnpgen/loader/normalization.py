@@ -32,27 +32,32 @@ class Normalization:
         """Field name -> 1 / std, 0 for constant columns, shape (c,)."""
         return {name: np.divide(1.0, std, out=np.zeros_like(std), where=std > 0) for name, std in self.std.items()}
 
-    def normalize(self, rows: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    def normalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """Return (x - mean) / std of the fields that have statistics, and others as they are.
 
         Args:
-            rows: Field name -> values in the field's unit, shape (..., width), or (...) of a scalar field.
+            rows: Field name -> values in the field's unit, shape (..., width), or (...) of a scalar field; arrays of
+                NumPy or JAX or tensors of torch, which stay what they are, and gradients go through.
         """
-        return {
-            name: _keeping(values, (values - self.mean[name]) * self.scale[name]) if name in self.mean else values
-            for name, values in rows.items()
-        }
+        return {name: self._scaled(name, values) for name, values in rows.items()}
 
-    def denormalize(self, rows: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    def denormalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """Return mean + std x, which undoes :meth:`normalize`; a constant column gets its one value back.
 
         Args:
-            rows: Field name -> normalised values, shape (..., width), or (...) of a scalar field.
+            rows: Field name -> normalised values, otherwise as for :meth:`normalize`.
         """
-        return {
-            name: _keeping(values, self.mean[name] + self.std[name] * values) if name in self.mean else values
-            for name, values in rows.items()
-        }
+        return {name: self._unscaled(name, values) for name, values in rows.items()}
+
+    def _scaled(self, name: str, values: Any) -> Any:
+        if name not in self.mean:
+            return values
+        return _keeping(values, (values - _beside(values, self.mean[name])) * _beside(values, self.scale[name]))
+
+    def _unscaled(self, name: str, values: Any) -> Any:
+        if name not in self.mean:
+            return values
+        return _keeping(values, values * _beside(values, self.std[name]) + _beside(values, self.mean[name]))
 
     def side_by_side(self, fields: Sequence[Field]) -> tuple[Floats, Floats]:
         """Return mean and scale of the columns of fields in the packed table, shape (columns,) each.
@@ -70,9 +75,14 @@ class Normalization:
         return mean, np.concatenate([nothing, *(self.scale[field.name] for field in fields)])
 
 
-def _keeping(values: NDArray[Any], result: NDArray[Any]) -> NDArray[Any]:
+def _beside(values: Any, numbers: Floats) -> Any:
+    """Return numbers as what can be computed with beside values: tensors of torch take only their like."""
+    return values.new_tensor(numbers) if hasattr(values, "new_tensor") else numbers
+
+
+def _keeping(values: Any, result: Any) -> Any:
     """Give a result the shape and type of the values that it was made of."""
-    return result.astype(values.dtype, copy=False).reshape(values.shape)
+    return (result if result.dtype == values.dtype else result.astype(values.dtype)).reshape(values.shape)
 
 
 def make_normalization(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> Normalization:

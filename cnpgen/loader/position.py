@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from cnpgen.arguments import integer
+from cnpgen.arguments import flag, integer
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.source import Source
 
@@ -29,14 +29,16 @@ class Position:
     row: int = 0
 
 
-def checked_position(*, seed: Any, shuffle: bool, epoch: Any, row: Any = 0) -> Position:
+def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Position:
     """Make a position of what somebody gave.
 
     Raises:
-        UsageError: Seed, epoch or row is no integer from 0 on.
+        UsageError: Seed, epoch or row is no integer from 0 on, or shuffle neither True nor False.
     """
     numbers = {"seed": seed, "epoch": epoch, "row": row}
-    return Position(shuffle=bool(shuffle), **{name: integer(name, value, least=0) for name, value in numbers.items()})
+    return Position(
+        shuffle=flag("shuffle", shuffle), **{name: integer(name, value, least=0) for name, value in numbers.items()}
+    )
 
 
 def position_to_json(position: Position, source: Source) -> dict[str, Any]:

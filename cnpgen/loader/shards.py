@@ -107,7 +107,7 @@ class ShardReader:
             return kept
         mapped = _mapped(shard)
         if mapped is not None:
-            for oldest in list(self._maps)[: len(self._maps) - MOST_MAPS + 1]:
+            for oldest in list(self._maps)[: max(len(self._maps) - MOST_MAPS + 1, 0)]:
                 self._maps.pop(oldest, None)  # stays mapped for as long as arrays of it are in use
             self._maps[shard.path] = mapped
         return mapped
