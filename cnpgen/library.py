@@ -88,6 +88,20 @@ def dataset_recipe_of(recipe: object) -> DatasetRecipe:
     raise UsageError(f"recipe must be {expected}, got {recipe!r}")
 
 
+def problem_of(problem: object) -> Problem:
+    """Return the problem that is meant: itself, or what its name or file says.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: With every mistake in the file.
+    """
+    if isinstance(problem, Problem):
+        return problem
+    if isinstance(problem, str | Path):
+        return load_problem(problem)
+    raise UsageError(f"problem must be the name of a problem, the path of a problem file or a Problem, got {problem!r}")
+
+
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
     """Rebuild a recipe from what ``recipes.resolved`` made of it, as plans of datasets keep it.
 

@@ -52,6 +52,21 @@ def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_diffe
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("start", [0.163, 0.19], ids=["in the band", "beyond it"])
+def test_the_gradient_of_a_motion_that_starts_off_the_table_is_that_of_central_differences(start):
+    of, given, random = loss("airhockey"), batch("hit", 6, by=0.1, seed=1), np.random.default_rng(5)
+    options = {"weights": 1e4 * weights_of(of, "table"), "start_tip": np.tile([0.65, 0.0, start], (6, 1))}
+    value, closed = given.evaluated(of, **options), given.evaluated(of, weights=options["weights"])
+    assert (value.terms[:, -1] < closed.terms[:, -1]).all()
+    assert np.abs(value.path_gradient - closed.path_gradient).max() > 0.1
+    for _ in range(3):
+        direction = random.normal(size=given.path.shape), random.normal(size=given.rate.shape)
+        expected = along(given, of, direction, **options)
+        found = np.einsum("kcn,kcn->k", value.path_gradient, direction[0])
+        found += np.einsum("kr,kr->k", value.rate_gradient, direction[1])
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("label", ["hit", "transport"])
 def test_single_components_of_the_gradient_of_all_terms_together_are_those_of_central_differences(label):
     of, given = loss(PROBLEM_OF[label]), far(label)[2:4]

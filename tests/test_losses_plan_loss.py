@@ -1,5 +1,7 @@
 """The loss: values against Pinocchio, Coal and SciPy, backends, margins and funnels, and what it refuses."""
 
+import copy
+import pickle
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -169,10 +171,14 @@ MISTAKES = {
     "rate must be an array of numbers, got str": {"rate": "fast"},
     "tops must have shape (3, 0), got (3, 2)": {"tops": np.zeros((3, 2))},
     "start_tip must have shape (3, 3), got (3,)": {"start_tip": np.zeros(3)},
+    "rate must be an array of numbers, got ndarray: complex128 is no real type": {"rate": np.ones((3, 20)) * 1j},
+    "weights must be an array of numbers, got str": {"weights": "abc"},
     "weights must have shape (5,) for joint-position": {"weights": np.ones(6)},
     "the weight of 'joint-torque' must be a number that is not negative, got -1.0": {"weights": [1, 1, 1, -1, 1]},
     "the weight of 'table' must be a number that is not negative, got nan": {"weights": [1, 1, 1, 1, np.nan]},
     "the shift of the quadrature nodes must be in [0, 1), got 1.5": {"shift": 1.5},
+    "shift must be a finite number, got None": {"shift": None},
+    "gradient must be True or False, got 'no'": {"gradient": "no"},
 }
 
 
@@ -197,7 +203,11 @@ def test_missing_heights_of_obstacles_are_an_error():
         ({"dtype": "float16"}, "dtype must be one of float64, float32, got 'float16'"),
         ({"form": "sined"}, r"form must be one of signed, paper, got 'sined' \(did you mean 'signed'"),
         ({"rule": "uniform"}, "between uniform nodes the ends of r hide violations"),
-        ({"nodes": 0}, "the number of quadrature nodes must be at least 1, got 0"),
+        ({"nodes": 0}, "the number of quadrature nodes must be an integer from 1 on, got 0"),
+        ({"nodes": 64.5}, "the number of quadrature nodes must be an integer from 1 on, got 64.5"),
+        ({"nodes": "64"}, "the number of quadrature nodes must be an integer from 1 on, got '64'"),
+        ({"rule": 3}, "quadrature rule 3 does not exist"),
+        ({"margins": {"table": 1e-3}}, "margins must be a Margins or None, got {'table': 0.001}"),
         ({"backend": "cuda"}, "backend 'cuda' does not exist"),
         ({"margins": Margins({"joint-velocty": 0.9})}, r"no such term.*did you mean 'joint-velocity'"),
         ({"margins": Margins({"joint-velocity": 98.5})}, "above 0 and at most 1, got 98.5"),
@@ -207,6 +217,24 @@ def test_missing_heights_of_obstacles_are_an_error():
 def test_options_that_cannot_be_meant_are_named(options, message):
     with pytest.raises(CnpgenError, match=message):
         PlanLoss(PROBLEMS["airhockey"], **options)
+
+
+def test_a_problem_may_be_named_and_nothing_else_is_one():
+    assert PlanLoss("airhockey").terms == loss("airhockey").terms
+    with pytest.raises(CnpgenError, match="did you mean 'airhockey'"):
+        PlanLoss("airhokey")
+    with pytest.raises(CnpgenError, match=r"problem must be the name of a problem, .* got None"):
+        PlanLoss(None)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda of: pickle.loads(pickle.dumps(of))])
+def test_a_loss_that_was_used_can_be_copied_and_sent_to_other_processes(copied):
+    of, given = PlanLoss("airhockey", nodes=8), batch("hit", 2)
+    tips = np.array([[0.65, 0.0, 0.19]] * 2)
+    expected = [given.evaluated(of, start_tip=tips, gradient=gradient) for gradient in (True, False)]
+    again = copied(of)
+    for gradient, value in zip((True, False), expected, strict=True):
+        np.testing.assert_array_equal(given.evaluated(again, start_tip=tips, gradient=gradient).terms, value.terms)
 
 
 # --- margins, funnels, other constraints ------------------------------------------------------------------------------

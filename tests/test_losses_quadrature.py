@@ -44,7 +44,8 @@ def test_gauss_integrates_polynomials_exactly():
     [
         (("uniform", 64), "expected one of cosine, gauss; between uniform nodes the ends of r hide violations"),
         (("cosin", 64), r"did you mean 'cosine'\?"),
-        (("cosine", 0), "must be at least 1, got 0"),
+        (("cosine", 0), "must be an integer from 1 on, got 0"),
+        (("cosine", 64.5), "must be an integer from 1 on, got 64.5"),
         (("cosine", 8, -0.1), r"must be in \[0, 1\), got -0.1"),
         (("cosine", 8, np.nan), r"must be in \[0, 1\), got nan"),
         (("gauss", 8, 0.5), "must be 0, Gauss nodes cannot be moved, got 0.5"),

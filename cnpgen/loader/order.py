@@ -1,8 +1,8 @@
 """The order of a split's rows in one epoch: arithmetic in seed, epoch and the shards' sizes; nothing is stored.
 
 The shards are permuted and dealt out to windows of about 2^18 rows; within a window the rows of all its shards are
-permuted together. A split of less than a window and a half is therefore shuffled uniformly as a whole; in larger ones rows
-of one shard stay within one window of their epoch. Every epoch deals the shards out anew.
+permuted together. A split of less than a window and a half is therefore shuffled uniformly as a whole; in larger ones
+rows of one shard stay within one window of their epoch. Every epoch deals the shards out anew.
 """
 
 import hashlib

@@ -1,5 +1,6 @@
 """Plans on their way into and out of the loss kernels: checked, cast, samples last, padded to whole vectors."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ class PlanBatch:
         rate: Rate control points [1/s], shape (N, R).
         tops: Heights of the obstacles [m], shape (N, obstacles).
         start_tip: Positions of the tip at the start [m], shape (N, 3), float64, or None.
-        good: Whether a plan is one: finite, with a positive rate; shape (N,).
+        good: Whether a plan is one: finite, with positive rate control points; shape (N,).
     """
 
     path: Array
@@ -69,32 +70,60 @@ def check_batch(
     """Make a batch of what a caller gives.
 
     Raises:
+        UsageError: A shape is wrong, the heights of the obstacles are missing, or something is no real number.
+    """
+    given = {"path": (path, dtype), "rate": (rate, dtype), "tops": (tops, dtype), "start_tip": (start_tip, "float64")}
+    found = {name: real_array(name, values, kind) for name, (values, kind) in given.items() if values is not None}
+    check_shapes(problem, {name: array.shape for name, array in found.items()})
+    good = np.asarray((found["rate"] > 0).all(axis=1))
+    for array in found.values():
+        good &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    heights = found.get("tops", np.zeros((len(good), 0), dtype))
+    return PlanBatch(found["path"], found["rate"], heights, found.get("start_tip"), good)
+
+
+def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse what cannot be plans of a problem by its shapes alone.
+
+    Args:
+        problem: The problem.
+        shapes: Those of ``path``, ``rate`` and, where they are given, ``tops`` and ``start_tip``.
+
+    Raises:
         UsageError: A shape is wrong, or the heights of the obstacles are missing.
     """
-    spec, n, obstacles = problem.trajectory, len(problem.robot.joints), len(problem.obstacle)
-    if tops is None and obstacles:
+    spec, obstacles = problem.trajectory, len(problem.obstacle)
+    if obstacles and "tops" not in shapes:
         names = ", ".join(box.name for box in problem.obstacle)
         raise UsageError(
             f"tops is missing: the problem {problem.name!r} has obstacles ({names}), whose heights it gives"
         )
-    with np.errstate(over="ignore"):
-        control = _array("path", path, (None, spec.path_control_points, n), dtype)
-        rates = _array("rate", rate, (len(control), spec.rate_control_points), dtype)
-    heights = _array("tops", np.zeros((len(control), 0)) if tops is None else tops, (len(control), obstacles), dtype)
-    tips = None if start_tip is None else _array("start_tip", start_tip, (len(control), 3), "float64")
-    good = (rates > 0).all(axis=1)
-    for array in (control, rates, heights, *([] if tips is None else [tips])):
-        good &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-    return PlanBatch(control, rates, heights, tips, np.asarray(good))
+    count = next(iter(shapes["path"]), 0)
+    tails = {
+        "path": (spec.path_control_points, len(problem.robot.joints)),
+        "rate": (spec.rate_control_points,),
+        "tops": (obstacles,),
+        "start_tip": (3,),
+    }
+    for name, tail in tails.items():
+        if name in shapes and shapes[name] != (count, *tail):
+            expected = ", ".join(str(size) for size in ("N" if name == "path" else count, *tail))
+            raise UsageError(f"{name} must have shape ({expected}), got {shapes[name]}")
 
 
-def _array(name: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: str) -> Array:
-    """Cast, or raise UsageError for another shape; None is any length."""
+def real_array(name: str, values: ArrayLike, dtype: str) -> Array:
+    """Cast to an array of floats.
+
+    Raises:
+        UsageError: These are no real numbers, or not in the memory of this process.
+    """
+    wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
     try:
-        array = np.asarray(values, dtype)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers, got {type(values).__name__}: {error}") from error
-    if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
-        expected = ", ".join("N" if size is None else str(size) for size in shape)
-        raise UsageError(f"{name} must have shape ({expected}), got {array.shape}")
-    return array
+        array = np.asarray(values)
+        with np.errstate(over="ignore"):
+            real: Array = array.real.astype(dtype, copy=False)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
+        raise UsageError(f"{wrong}: {error}") from error
+    if array.dtype.kind in "cUSmM":  # NumPy would drop an imaginary part, and read texts
+        raise UsageError(f"{wrong}: {array.dtype} is no real type")
+    return real

@@ -1,5 +1,6 @@
 """The loss of plans with its gradient: integrals of the step losses over the phase."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -8,14 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen import plugins
+from cnpgen.arguments import flag, number
 from cnpgen.errors import UsageError, nearest
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
 from cnpgen.kernels.tape import DTYPES, Dtype
+from cnpgen.library import problem_of
 from cnpgen.losses.funnel import Funnel, make_funnel
 from cnpgen.losses.margins import Margins
-from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch
-from cnpgen.losses.quadrature import Table, basis_table, quadrature
+from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes, real_array
+from cnpgen.losses.quadrature import Table, basis_table, check_quadrature
 from cnpgen.losses.stage import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
 from cnpgen.losses.value import LossValue
 from cnpgen.recipes import Problem
@@ -23,13 +26,14 @@ from cnpgen.robots.robot import load_robot
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
+_BUILT = {"_gradient", "_values", "_funnel"}
 
 
 class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
 
     Args:
-        problem: The problem.
+        problem: The problem, or its name or file.
         dtype: "float32" or "float64": what is computed with.
         nodes: Number of quadrature nodes.
         rule: Quadrature rule: "cosine" or "gauss".
@@ -50,7 +54,7 @@ class PlanLoss:
 
     def __init__(
         self,
-        problem: Problem,
+        problem: Problem | str | Path,
         *,
         dtype: Dtype = "float32",
         nodes: int = 64,
@@ -60,20 +64,23 @@ class PlanLoss:
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
-        for name, value, known in (("dtype", dtype, DTYPES), ("form", form, FORMS)):
-            if value not in known:
-                raise UsageError(f"{name} must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}")
-        quadrature(rule, nodes)  # raises for what it does not know
-        self.problem, self.dtype, self.nodes, self.rule, self.form = problem, dtype, nodes, rule, form
-        self.terms = ("time", *_names(problem))
-        self.budgets = np.array([constraint.budget for constraint in problem.constraint])
-        self.weights0 = np.array([constraint.weight for constraint in problem.constraint])
-        self._tightening = (margins or Margins()).tightening(self.terms[1:]).astype(dtype)
-        self._robot = load_robot(problem)
+        _check_choice("dtype", dtype, DTYPES)
+        _check_choice("form", form, FORMS)
+        check_quadrature(rule, nodes)
+        self.problem, self.dtype, self.nodes, self.rule, self.form = problem_of(problem), dtype, nodes, rule, form
+        self.terms = ("time", *_names(self.problem))
+        self.budgets = np.array([constraint.budget for constraint in self.problem.constraint])
+        self.weights0 = np.array([constraint.weight for constraint in self.problem.constraint])
+        self._tightening = _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
+        self._robot = load_robot(self.problem)
         chosen, folder = choose_backend(backend)
-        arguments = {"robot": self._robot, "problem": problem}
         folder = folder if cache_folder is None else Path(cache_folder)
-        self._kernels = KernelLibrary(chosen, folder, problem_identity(problem), arguments)
+        arguments = {"robot": self._robot, "problem": self.problem}
+        self._kernels = KernelLibrary(chosen, folder, problem_identity(self.problem), arguments)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was built for this process; it is built again when it is needed."""
+        return {name: part for name, part in vars(self).items() if name not in _BUILT}
 
     def __call__(
         self,
@@ -99,10 +106,11 @@ class PlanLoss:
             gradient: Whether gradients are wanted; without, theirs are arrays of no plan, shape (0, C, n) and (0, R).
 
         Raises:
-            UsageError: A shape is wrong, or a weight is negative or not finite.
+            UsageError: A shape is wrong, something is no real number, or a weight is negative or not finite.
         """
+        gradient, shift = flag("gradient", gradient), number("shift", shift)
         batch = check_batch(self.problem, path, rate, tops, start_tip, dtype=self.dtype)
-        scales = self._checked(weights)
+        scales = self.checked_weights(weights)
         table = basis_table(self.problem.trajectory, self.rule, self.nodes, shift, self.dtype)
         n, wanted = len(batch), slice(None) if gradient else slice(0)
         terms = np.empty((n, len(self.terms)), self.dtype)
@@ -145,15 +153,35 @@ class PlanLoss:
             out[..., : len(batch)] = self._funnel.width(table.s, batch.start_tip)
         return out
 
-    def _checked(self, weights: ArrayLike) -> Array:
-        given = np.asarray(weights, float)
-        names = self.terms[1:]
-        if given.shape != (len(names),):
-            raise UsageError(f"weights must have shape ({len(names)},) for {', '.join(names)}, got {given.shape}")
-        for name, weight in zip(names, given.tolist(), strict=True):
+    def check_shapes(self, **shapes: tuple[int, ...]) -> None:
+        """Refuse arguments by their shapes alone, as bridges do where values are not known yet.
+
+        Args:
+            shapes: Those of ``path``, ``rate``, ``weights`` and, where they are given, ``tops`` and ``start_tip``.
+
+        Raises:
+            UsageError: A shape is wrong, or the heights of the obstacles are missing.
+        """
+        self._check_count(shapes.pop("weights"))
+        check_shapes(self.problem, shapes)
+
+    def checked_weights(self, weights: ArrayLike) -> Array:
+        """Return weights in the loss's precision.
+
+        Raises:
+            UsageError: The shape is wrong, or a weight is negative or not finite.
+        """
+        given = real_array("weights", weights, "float64")
+        self._check_count(given.shape)
+        for name, weight in zip(self.terms[1:], given.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:
                 raise UsageError(f"the weight of {name!r} must be a number that is not negative, got {weight}")
         return given.astype(self.dtype)
+
+    def _check_count(self, shape: tuple[int, ...]) -> None:
+        names = self.terms[1:]
+        if shape != (len(names),):
+            raise UsageError(f"weights must have shape ({len(names)},) for {', '.join(names)}, got {shape}")
 
     @cached_property
     def _gradient(self) -> GridKernel:
@@ -166,6 +194,17 @@ class PlanLoss:
     @cached_property
     def _funnel(self) -> Funnel:
         return make_funnel(self.problem, self._robot, self.form)
+
+
+def _check_choice(name: str, value: object, known: Sequence[str]) -> None:
+    if value not in known:
+        raise UsageError(f"{name} must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}")
+
+
+def _checked_margins(margins: object) -> Margins:
+    if not isinstance(margins, Margins | None):
+        raise UsageError(f"margins must be a Margins or None, got {margins!r:.100}")
+    return margins or Margins()
 
 
 def _names(problem: Problem) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arguments import integer
 from cnpgen.errors import UsageError, nearest
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.spline import basis
@@ -33,22 +34,27 @@ def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]
         ``(s, weights)``, shape (K,) each; the weights sum to 1.
 
     Raises:
-        UsageError: There is no such rule, no node, or the shift is not in [0, 1).
+        UsageError: There is no such rule, no whole number of nodes, or the shift is not in [0, 1).
     """
-    if rule not in RULES:
-        reason = "; between uniform nodes the ends of r hide violations" if rule == "uniform" else nearest(rule, RULES)
-        raise UsageError(f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}")
-    if nodes < 1:
-        raise UsageError(f"the number of quadrature nodes must be at least 1, got {nodes}")
-    if not 0 <= shift < 1 or (rule == "gauss" and shift != 0):
-        expected = "0, Gauss nodes cannot be moved" if rule == "gauss" else "in [0, 1)"
-        raise UsageError(f"the shift of the quadrature nodes must be {expected}, got {shift}")
+    check_quadrature(rule, nodes, shift)
     if rule == "gauss":
         x, weights = np.polynomial.legendre.leggauss(nodes)
         return (1 + x) / 2, weights / 2
     theta = np.pi * (np.arange(nodes) + (0.5 + shift) % 1) / nodes
     weights = np.sin(theta)
     return (1 - np.cos(theta)) / 2, weights / weights.sum()
+
+
+def check_quadrature(rule: str, nodes: int, shift: float = 0.0) -> None:
+    """Refuse what :func:`quadrature` knows nothing of."""
+    if rule not in RULES:
+        uniform = rule == "uniform"
+        reason = "; between uniform nodes the ends of r hide violations" if uniform else nearest(str(rule), RULES)
+        raise UsageError(f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}")
+    integer("the number of quadrature nodes", nodes, least=1)
+    if not 0 <= shift < 1 or (rule == "gauss" and shift != 0):
+        expected = "0, Gauss nodes cannot be moved" if rule == "gauss" else "in [0, 1)"
+        raise UsageError(f"the shift of the quadrature nodes must be {expected}, got {shift}")
 
 
 def rotating_shift(step: int, count: int = 8) -> float:

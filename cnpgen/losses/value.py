@@ -10,7 +10,10 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class LossValue:
-    """What N plans cost. A plan that is none (not finite, or r not positive) costs nan, and no other is touched.
+    """What N plans cost. A plan that is none costs nan, and no other is touched.
+
+    A plan is none if a control point is not finite, or a control point of the rate not positive: r(s) lies between the
+    least and the largest of them, so that positive ones are enough, though not needed, for a motion that runs forward.
 
     Attributes:
         total: Task loss plus the weighted constraint terms, shape (N,).
