@@ -1,15 +1,18 @@
 """Schedule, order of rows, clipping and settings: each follows from little, and says what it refuses."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.losses.schedule import MetricSettings
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.order import Order
+from cnpgen.training.margins import suggested_margins
 from cnpgen.training.schedule import learning_rate
-from cnpgen.training.settings import Length, TrainingSettings
+from cnpgen.training.settings import METRICS, Length, TrainingSettings
+from cnpgen.training.step_rows import StepRows
 
 
 def rate(step: int) -> float:
@@ -26,7 +29,7 @@ def test_the_learning_rate_rises_to_its_peak_and_falls_as_a_cosine():
 
 
 def test_an_epoch_sees_every_row_once_but_for_those_that_fill_no_batch():
-    order = Order(103, 10, seed=5)
+    order = StepRows(103, 10, seed=5)
     epoch = np.concatenate([order.batch(step) for step in range(10)])
     assert len(np.unique(epoch)) == 100
     other = np.concatenate([order.batch(step) for step in range(10, 20)])
@@ -35,16 +38,16 @@ def test_an_epoch_sees_every_row_once_but_for_those_that_fill_no_batch():
 
 
 def test_the_order_is_arithmetic_in_seed_and_step():
-    order, again = Order(64, 8, seed=1), Order(64, 8, seed=1)
+    order, again = StepRows(64, 8, seed=1), StepRows(64, 8, seed=1)
     steps = [0, 31, 7, 8, 100, 0]  # in any sequence
     for step in steps:
-        np.testing.assert_array_equal(order.batch(step), Order(64, 8, seed=1).batch(step))
+        np.testing.assert_array_equal(order.batch(step), StepRows(64, 8, seed=1).batch(step))
         np.testing.assert_array_equal(order.batch(step), again.batch(step))
-    assert (Order(64, 8, seed=2).batch(0) != order.batch(0)).any()
+    assert (StepRows(64, 8, seed=2).batch(0) != order.batch(0)).any()
 
 
 def test_fewer_rows_than_a_batch_are_one_batch():
-    assert sorted(Order(5, 64, seed=0).batch(3)) == [0, 1, 2, 3, 4]
+    assert sorted(StepRows(5, 64, seed=0).batch(3)) == [0, 1, 2, 3, 4]
 
 
 def test_samples_are_clipped_to_so_many_running_medians():
@@ -70,14 +73,40 @@ def test_without_a_limit_nothing_is_clipped():
     assert clipping.batch_factor(1.0, limit=math.inf) == clipping.batch_factor(1e30, limit=math.inf) == 1.0
 
 
-@pytest.mark.parametrize("wrong", [{"hidden": 0}, {"batch_size": -1}, {"learning_rate": 0.0}, {"sample_clip": np.nan}])
-def test_settings_that_cannot_be_meant_are_refused_by_name(wrong):
-    ((name, value),) = wrong.items()
-    with pytest.raises(UsageError, match=f"{name} must be .*, got {value}"):
-        TrainingSettings(**wrong)
+WRONG: list[tuple[str, Any]] = [
+    ("hidden", 0), ("hidden", 2.5), ("batch_size", -1), ("seed", -1), ("bending_steps", -1), ("nodes", "32"),
+    ("learning_rate", 0.0), ("learning_rate", math.inf), ("learning_rate", "1e-3"), ("final_rate", -5),
+    ("memory", 2), ("memory", 1.0), ("imitation", 1.0), ("sample_clip", math.nan), ("head_scale", -0.1),
+    ("rate_bias", math.inf), ("warm_up", 1.5),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("wrong", [{}, {"steps": 5, "epochs": 2}, {"cpu_seconds": 0.0}])
+@pytest.mark.parametrize(("name", "value"), WRONG)
+def test_settings_that_cannot_be_meant_are_refused_by_name(name, value):
+    with pytest.raises(UsageError, match=f"^{name} must be .*, got {value!r}"):
+        TrainingSettings(**{name: value})
+
+
+def test_weights_that_grow_without_end_are_refused_by_what_was_said():
+    with pytest.raises(UsageError, match=r"growth must be .*, got inf"):
+        TrainingSettings(metric=MetricSettings(growth=math.inf))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{}, {"steps": 5, "epochs": 2}, {"cpu_seconds": 0.0}, {"cpu_seconds": math.inf}, {"steps": 2.5}, {"epochs": "3"}],
+)
 def test_a_run_has_one_length(wrong):
-    with pytest.raises(UsageError, match=r"how long|above 0"):
+    with pytest.raises(UsageError, match=r"how long|(steps|epochs|cpu_seconds) must be .*, got "):
         Length(**wrong)
+
+
+def test_the_paper_s_form_of_the_loss_goes_with_the_paper_s_metric():
+    forms = {name: TrainingSettings(metric=metric).form for name, metric in METRICS.items()}
+    assert forms == {"fixed": "signed", "ramped": "signed", "learned": "paper", "bounded": "signed"}
+
+
+def test_every_constraint_of_a_kind_has_the_margin_of_its_kind():
+    margins = suggested_margins(("time", "table", "table-2", "joint-torque-3", "keep-out-2"))
+    assert margins.insets == {"table": 1e-3, "table-2": 1e-3}
+    assert margins.factors == {"joint-torque-3": 0.97}

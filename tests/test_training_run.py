@@ -149,6 +149,17 @@ def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
     assert (tmp_path / "model.h5").read_bytes() == b"mine"
 
 
+@pytest.mark.parametrize("wrong", [{"check_rows": 0}, {"steps": 2.5}, {"steps": None, "cpu_seconds": float("inf")}])
+def test_arguments_that_cannot_be_meant_are_refused_by_name(train, wrong):
+    with pytest.raises(UsageError, match=r"^(check_rows|steps|cpu_seconds) must be .*, got (0|2\.5|inf)"):
+        train(**wrong)
+
+
+def test_whole_numbers_of_numpy_make_the_same_run(train):
+    train(steps=np.int64(STEPS), settings=replace(SMALL, seed=np.int64(2)), check_rows=np.int32(2))
+    assert not train(settings=replace(SMALL, seed=2)).made
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_the_run_after_the_step_that_it_came_in(train, tmp_path, number):
     whole = train("whole.h5")
@@ -201,6 +212,76 @@ def test_a_damaged_checkpoint_is_an_error_and_no_other_model(train, tmp_path):
     path.write_bytes(data)
     with pytest.raises(DatasetError, match=r"model\.checkpoint is damaged"):
         train()
+
+
+def test_deaths_between_the_last_step_and_the_model_leave_one_last_line(train, tmp_path, monkeypatch):
+    """The log's last line comes after the last checkpoint: what dies while the model is written writes it again."""
+    whole = train("whole.h5")
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr("cnpgen.training.train.save_model", dying)
+            with pytest.raises(CutOffError):
+                train("cut.h5")
+    cut = train("cut.h5")
+    assert lines(cut.model) == lines(whole.model)
+    assert sum("final" in line for line in (tmp_path / "cut.jsonl").read_text().splitlines()) == 1
+    np.testing.assert_array_equal(cut.model.parameters, whole.model.parameters)
+
+
+def dying(*_: Any) -> None:
+    raise CutOffError
+
+
+@pytest.mark.parametrize("left", [None, b"", b'{"step": 1'])
+def test_a_resumed_run_has_its_whole_log_whatever_became_of_the_file(train, tmp_path, left):
+    whole = train("whole.h5")
+    with pytest.raises(CutOffError):
+        train("cut.h5", watch=cut_at(20))
+    log = tmp_path / "cut.jsonl"
+    log.unlink() if left is None else log.write_bytes(left)
+    cut = train("cut.h5", force=True)
+    assert lines(cut.model) == lines(whole.model)
+    assert log.read_text() == cut.model.log
+
+
+def test_the_log_is_never_half_written_over(train, tmp_path, monkeypatch):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(20))
+    before = (tmp_path / "model.jsonl").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", dying)  # as if killed before the new file has its name
+        with pytest.raises(CutOffError):
+            train()
+    assert (tmp_path / "model.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["model.jsonl", "model.png"])
+def test_files_of_others_beside_the_model_are_not_replaced_without_force(train, tmp_path, name):
+    path = tmp_path / name
+    path.write_text('{"step": 1, "my": "data"}\n')
+    with pytest.raises(UsageError, match=rf"{name} is there.*--force replaces it"):
+        train(begin=lambda *_: pytest.fail("trained"))
+    assert path.read_text() == '{"step": 1, "my": "data"}\n'
+    assert train(force=True).made
+
+
+def test_the_log_and_the_picture_of_a_run_are_replaced_by_those_of_the_next_one(train, tmp_path):
+    train()
+    (tmp_path / "model.h5").unlink()
+    (tmp_path / "model.png").write_bytes(b"drawn of the log")
+    assert train(steps=31).made
+
+
+def test_what_killed_runs_were_writing_is_removed_and_nothing_else(train, tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
+        gone.wait()
+    mine = [f".model.{end}.{gone.pid}.{'0' * 32}.tmp" for end in ("h5", "checkpoint", "jsonl")]
+    others = [f".model.h5.{os.getppid()}.{'0' * 32}.tmp", f".other.h5.{gone.pid}.{'0' * 32}.tmp", ".model.h5.tmp"]
+    for name in (*mine, *others):
+        (tmp_path / name).write_bytes(b"half")
+    train()
+    left = {path.name for path in tmp_path.iterdir() if path.name.startswith(".")}
+    assert left == set(others)
 
 
 def test_a_dataset_that_has_changed_since_is_not_trained_on_further(train, tmp_path):

@@ -1,5 +1,6 @@
 """The network's inputs: start and goal states and what follows from them, standardised as in the training rows."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,10 +36,15 @@ class Features:
         return ((raw - self.mean) * self.scale).astype(dtype)
 
 
-def fit_features(tasks: Tasks, blocks: tuple[str, ...] = BLOCKS) -> Features:
-    """Measure mean and standard deviation of every feature on the training rows."""
-    raw = raw_features(tasks, blocks)
-    mean, deviation = raw.mean(axis=0), raw.std(axis=0)
+def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = BLOCKS) -> Features:
+    """Measure mean and standard deviation of every feature on the training rows, which come in parts."""
+    count, mean, squares = 0, np.zeros(1), np.zeros(1)
+    for tasks in parts:
+        raw = raw_features(tasks, blocks)
+        new, total = raw.mean(axis=0) - mean, count + len(raw)
+        squares = squares + raw.var(axis=0) * len(raw) + new**2 * (count * len(raw) / total)  # Chan et al., 1983
+        count, mean = total, mean + new * (len(raw) / total)
+    deviation = np.sqrt(squares / count)
     constant = deviation < CONSTANT
     return Features(blocks, mean, np.where(constant, 0.0, 1 / np.where(constant, 1.0, deviation)))
 

@@ -1,6 +1,7 @@
 """Files that are whole or absent: written under a temporary name, flushed to the disk, then renamed."""
 
 import errno
+import glob
 import hashlib
 import os
 import time
@@ -125,6 +126,25 @@ def file_sha256(path: Path) -> str:
         raise DatasetError(f"{path} is missing") from error
     except OSError as error:
         raise machine_error("read", path, error) from error
+
+
+def sweep_dead(path: Path) -> None:
+    """Remove what processes that are no more have left of writing a file beside it."""
+    with suppress(OSError):
+        for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+            owner = leftover.name.removeprefix(f".{path.name}.").partition(".")[0]
+            if owner.isdigit() and not _is_alive(int(owner)):
+                leftover.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def sweep(work: Path, *, older_than: float = 3600.0) -> None:

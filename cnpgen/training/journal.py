@@ -1,28 +1,29 @@
-"""The training log: one JSON object per line, in a file that a resumed run goes on with."""
+"""The training log: one JSON object per line, in a file for who watches; what counts is in the checkpoint."""
 
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cnpgen.store.files import machine_error
+from cnpgen.store.files import machine_error, write_file
+
+OURS = {"step", "epoch", "learning_rate", "seconds", "lost"}  # keys of the first line of every log
 
 
 class Journal:
     """Appends to a log.
 
     Args:
-        path: The file.
-        step: Lines of later steps are dropped: the run is resumed here and will write them again.
+        path: The file; what is in it is replaced by ``lines``.
+        lines: The log so far; new lines are appended to this very list, too.
+
+    Raises:
+        MachineError: The disk is full, read-only or otherwise unwilling.
     """
 
-    def __init__(self, path: Path, step: int = 0) -> None:
-        self.path = path
-        self.lines = [line for line in _lines(path) if json.loads(line).get("step", 0) <= step] if step else []
-        try:
-            path.write_text("".join(f"{line}\n" for line in self.lines), encoding="utf-8")
-        except OSError as error:
-            raise machine_error("write", path, error) from error
+    def __init__(self, path: Path, lines: list[str]) -> None:
+        self.path, self.lines = path, lines
+        write_file(path, self.text)
 
     def write(self, record: Mapping[str, Any]) -> None:
         """Append a record.
@@ -43,23 +44,13 @@ class Journal:
         """The whole log."""
         return "".join(f"{line}\n" for line in self.lines)
 
-    def records(self) -> list[dict[str, Any]]:
-        """The whole log, read."""
-        return [json.loads(line) for line in self.lines]
 
-
-def _lines(path: Path) -> list[str]:
-    """Read the whole lines of a log; the last one may have been cut off."""
+def is_log(path: Path) -> bool:
+    """Whether a file is a training log, by its first line, or holds nothing yet."""
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return []
-    whole = text[: text.rfind("\n") + 1].splitlines()
-    return [line for line in whole if _is_record(line)]
-
-
-def _is_record(line: str) -> bool:
-    try:
-        return isinstance(json.loads(line), dict)
-    except ValueError:
+        with path.open("rb") as file:
+            first = file.readline(1 << 16)
+        record = json.loads(first or "null")
+    except (OSError, ValueError):
         return False
+    return not first or (isinstance(record, dict) and record.keys() >= OURS)

@@ -1,6 +1,7 @@
 """How much room training leaves to the bounds, by the kind of constraint."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 
 from cnpgen.losses.margins import Margins
 
@@ -13,9 +14,11 @@ def suggested_margins(terms: Sequence[str]) -> Margins:
     """Return the margins of the terms whose kinds are known; none of others.
 
     Args:
-        terms: ``PlanLoss.terms``.
+        terms: ``PlanLoss.terms``; the second of a kind is called ``kind-2``.
     """
-    return Margins(
-        {name: FACTORS[name] for name in terms if name in FACTORS},
-        {name: INSETS[name] for name in terms if name in INSETS},
-    )
+    return Margins(_known(terms, FACTORS), _known(terms, INSETS))
+
+
+def _known(terms: Sequence[str], by_kind: Mapping[str, float]) -> dict[str, float]:
+    kinds = {name: re.sub(r"-\d+$", "", name) for name in terms}
+    return {name: by_kind[kind] for name, kind in kinds.items() if kind in by_kind}

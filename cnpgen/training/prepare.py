@@ -47,8 +47,8 @@ def prepare_run(
     Raises:
         UsageError: Plans are to be imitated, and the dataset has none.
     """
-    boundary = source.boundary(source.train)
-    rest = resting(boundary)
+    boundary = source.training()
+    rest, spec = resting(boundary), given.problem.trajectory
     kit = make_kit(
         given,
         bending_steps=settings.bending_steps,
@@ -59,24 +59,19 @@ def prepare_run(
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
     loss = _loss(given, settings)
-    weights = loss.weights0 if settings.metric.kind == "learned" else suggested_weights(loss.terms, loss.weights0)
-    held_out = source.boundary(source.validation, check_rows)
+    held_out = source.checked(check_rows)
     architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
     run = Run(
-        learner=Learner(architecture, given.problem.trajectory, loss, settings, _landing(given, settings)),
+        learner=Learner(architecture, spec, loss, settings, _landing(given, settings)),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
         features=features,
-        metric=Metric(weights, loss.budgets, settings.metric),
+        metric=_metric(loss, settings),
         problem=given.record,
         validate=lambda model: validate(model, kit, held_out),
         rest=rest,
-        training={
-            "command": command,
-            **identity(source, settings),
-            "stages": stages_of(source.dataset.plan),
-        },
+        training={"command": command, **identity(source, settings), "stages": stages_of(source.dataset.plan)},
     )
     return run, kit
 
@@ -116,13 +111,20 @@ def _landing(given: Surroundings, settings: TrainingSettings) -> Landing | None:
 def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
     backend = given.kernels.backend
     names = PlanLoss(given.problem, nodes=settings.nodes, backend=backend).terms  # its kernels are built when needed
-    return PlanLoss(given.problem, nodes=settings.nodes, backend=backend, margins=suggested_margins(names))
+    margins = suggested_margins(names)
+    return PlanLoss(given.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
+
+
+def _metric(loss: PlanLoss, settings: TrainingSettings) -> Metric:
+    learned = settings.metric.kind == "learned"
+    weights = loss.weights0 if learned else suggested_weights(loss.terms, loss.weights0)
+    return Metric(weights, loss.budgets, settings.metric)
 
 
 def begin_run(run: Run, length: Length) -> State:
     """Start a run; find out how many steps it has."""
     if length.steps is not None:
-        steps = length.steps
+        steps = int(length.steps)
     elif length.epochs is not None:
         steps = max(round(length.epochs * run.order.batches), 1)
     else:
@@ -152,4 +154,4 @@ def _step_seconds(run: Run) -> float:
         run.step(state, gradient)
         times.append(time.process_time() - begun)
     run.metric.load_state(metric)
-    return float(np.mean(times[WARMING:]))
+    return float(np.median(times[WARMING:]))

@@ -16,12 +16,12 @@ from cnpgen.planner.model import Meaning, Model
 from cnpgen.plans.problem import ProblemRecord
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.journal import Journal
-from cnpgen.training.order import Order
 from cnpgen.training.rows import Rows
 from cnpgen.training.schedule import learning_rate
 from cnpgen.training.signals import signals_wait
 from cnpgen.training.state import Best, State, Sums
 from cnpgen.training.step import Learner
+from cnpgen.training.step_rows import StepRows
 
 Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]
@@ -62,7 +62,7 @@ class Run:
 
     def __post_init__(self) -> None:
         settings = self.learner.settings
-        self.order = Order(len(self.rows), settings.batch_size, settings.seed)
+        self.order = StepRows(len(self.rows), settings.batch_size, settings.seed)
 
     def go_on(self, state: State, checkpoints: Checkpoints, journal: Journal, watch: Watcher | None = None) -> None:
         """Train until the end.
@@ -97,8 +97,8 @@ class Run:
             if watch is not None:
                 watch(record)
 
-    def model(self, parameters: Array, *, log: str = "", training: Mapping[str, Any] | None = None) -> Model:
-        """Make a model of parameters; ``training`` is added to what it says of how it was made."""
+    def model(self, parameters: Array) -> Model:
+        """Make a model of parameters."""
         settings = self.learner.settings
         return Model(
             problem=self.problem,
@@ -111,8 +111,7 @@ class Run:
                 landing_steps=settings.landing_steps,
             ),
             rest=self.rest,
-            training={**self.training, **(training or {})},
-            log=log,
+            training=self.training,
         )
 
     def step(self, state: State, gradient: Array) -> None:

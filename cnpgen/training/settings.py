@@ -1,7 +1,10 @@
 """How a model is trained."""
 
+import math
 from dataclasses import dataclass, field
+from typing import Any
 
+from cnpgen.arguments import integer, number
 from cnpgen.errors import UsageError
 from cnpgen.losses.schedule import BOUNDED, PUBLISHED, MetricSettings
 
@@ -11,6 +14,15 @@ METRICS = {
     "learned": PUBLISHED,
     "bounded": BOUNDED,
 }
+LEAST = {
+    "hidden": 1, "layers": 1, "batch_size": 1, "nodes": 1, "shifts": 1,
+    "warm_up": 0, "seed": 0, "bending_steps": 0, "landing_steps": 0,
+}  # fmt: skip
+INTERVALS = {
+    "learning_rate": "(0, inf)", "final_rate": "[0, 1]", "path_scale": "(0, inf)", "head_scale": "[0, inf)",
+    "rate_bias": "(-inf, inf)", "sample_clip": "(0, inf]", "batch_clip": "(0, inf]", "memory": "[0, 1)",
+    "imitation": "[0, 1)",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,14 +72,16 @@ class TrainingSettings:
     imitation: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("hidden", "layers", "batch_size", "nodes", "shifts"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("learning_rate", "path_scale", "sample_clip", "batch_clip"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"{name} must be above 0, got {getattr(self, name)}")
-        if not 0 <= self.imitation < 1:
-            raise UsageError(f"imitation must be at least 0 and below 1, got {self.imitation}")
+        for name, least in LEAST.items():
+            integer(name, getattr(self, name), least=least)
+        for name, interval in INTERVALS.items():
+            _within(name, getattr(self, name), interval)
+        _within("growth", self.metric.growth, "(0, inf)")
+
+    @property
+    def form(self) -> str:
+        """Form of the loss: "paper" where the metric is the paper's, whose budgets are meant for it, else "signed"."""
+        return "paper" if self.metric.kind == "learned" and self.metric.every == "epoch" else "signed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +102,15 @@ class Length:
         given = {name: value for name, value in vars(self).items() if value is not None}
         if len(given) != 1:
             raise UsageError(f"say how long to train by one of steps, epochs or cpu_seconds, got {given or 'none'}")
-        ((name, value),) = given.items()
-        if not value > 0:
-            raise UsageError(f"{name} must be above 0, got {value}")
+        if self.steps is not None:
+            integer("steps", self.steps, least=1)
+        else:
+            _within(*given.popitem(), "(0, inf)")
+
+
+def _within(name: str, value: Any, interval: str) -> None:
+    """Refuse what is no number, or not in an interval such as ``[0, 1)``, which may hold infinity."""
+    low, high = map(float, interval[1:-1].split(","))
+    found = value if isinstance(value, float) and math.isinf(value) else number(name, value)
+    if not low <= found <= high or (found == low and interval[0] == "(") or (found == high and interval[-1] == ")"):
+        raise UsageError(f"{name} must be in {interval}, got {value!r}")

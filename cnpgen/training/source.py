@@ -30,14 +30,29 @@ class Source:
     train: str
     validation: str
 
-    def boundary(self, split: str, rows: int | None = None) -> Boundary:
-        """Read boundary conditions; the first rows, or all."""
-        dataset = self.dataset
-        names = [name for name in BOUNDARY if name in dataset.fields]
-        if rows is None:
-            return boundary_columns(dataset.arrays(split, fields=names, dtype="float64"))
-        count = min(rows, dataset.splits[split])
-        return boundary_columns(dataset.rows(split, list(range(count)), fields=names, dtype="float64"))
+    def training(self) -> Boundary:
+        """Read the boundary conditions of all rows that are trained on."""
+        return boundary_columns(self.dataset.arrays(self.train, fields=self._names, dtype="float64"))
+
+    def checked(self, rows: int) -> Boundary:
+        """Read the validation rows that models are compared by: the first ones, half of all at most."""
+        return self._validation(0, self._checks(rows))
+
+    def judged(self, rows: int, *, after: int) -> Boundary:
+        """Read the validation rows that the last model is judged on: those that follow the compared ``after``."""
+        first = self._checks(after)
+        return self._validation(first, first + rows)
+
+    def _checks(self, rows: int) -> int:
+        return min(rows, self.dataset.splits[self.validation] // 2)
+
+    def _validation(self, first: int, stop: int) -> Boundary:
+        rows = list(range(first, min(stop, self.dataset.splits[self.validation])))
+        return boundary_columns(self.dataset.rows(self.validation, rows, fields=self._names, dtype="float64"))
+
+    @property
+    def _names(self) -> list[str]:
+        return [name for name in BOUNDARY if name in self.dataset.fields]
 
     def demonstrations(self, joints: int) -> ControlPoints | None:
         """Read the plans of a certified dataset's training rows; None if it has none."""
@@ -72,7 +87,10 @@ def open_source(folder: str | Path) -> Source:
         raise DatasetError(f"{folder} needs a split to train on and another one to validate with, it has {names}")
     train = "train" if "train" in names else names[0]
     others = [name for name in names if name != train]
-    return Source(dataset, train, "validation" if "validation" in others else others[0])
+    validation = "validation" if "validation" in others else others[0]
+    if dataset.splits[validation] < 2:
+        raise DatasetError(f"{folder} has 1 row in {validation!r}: models are compared by some and judged on others")
+    return Source(dataset, train, validation)
 
 
 def stages_of(plan: DatasetPlan) -> list[dict[str, Any]]:

@@ -79,6 +79,7 @@ class State:
         best: The best model so far.
         seconds: CPU time of all steps [s].
         checking: CPU time of validation [s].
+        log: Lines of the log so far.
     """
 
     adam: Adam
@@ -90,6 +91,7 @@ class State:
     metric: Mapping[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     checking: float = 0.0
+    log: list[str] = field(default_factory=list)
 
     def progress(self, step: int) -> float:
         """Return how much of the run is done at a step, without the part that imitates; in [0, 1]."""
@@ -124,9 +126,8 @@ def to_content(state: State) -> Content:
         "seconds": state.seconds,
         "checking": state.checking,
     }
-    return Content(
-        {**arrays, "best": best.parameters, "terms": state.sums.terms}, {"numbers": json.dumps(numbers, indent=1)}
-    )
+    texts = {"numbers": json.dumps(numbers, indent=1), "log": "\n".join(state.log)}
+    return Content({**arrays, "best": best.parameters, "terms": state.sums.terms}, texts)
 
 
 def from_content(content: Content) -> State:
@@ -149,4 +150,5 @@ def from_content(content: Content) -> State:
         numbers["metric"],
         numbers["seconds"],
         numbers["checking"],
+        content.texts["log"].splitlines(),
     )

@@ -88,25 +88,25 @@ class Learner:
     ) -> Array:
         network = self.architecture.split(parameters)
         given = forward(network, rows.features)
-        scale, spec = self.settings.path_scale, self.spec
-        points = control_points(rows.tasks, given.path, given.log_rate, scale=scale, spec=spec)
+        scale = self.settings.path_scale
+        points = control_points(rows.tasks, given.path, given.log_rate, scale=scale, spec=self.spec)
         value = cost(self._landed(points, rows))
-        by_path = value.path_gradient.astype(parameters.dtype, copy=False)
-        if self.landing is not None:
-            by_path = self.landing.pull_back(points.path, rows.tops, by_path)
-        phi, log_rate = pull_back(
-            rows.tasks,
-            points,
-            path_gradient=by_path,
-            rate_gradient=value.rate_gradient.astype(parameters.dtype, copy=False),
-            scale=scale,
-            spec=spec,
-        )
+        phi, log_rate = self._pulled_back(rows, points, value)
         factors = self._factors(phi, log_rate, clipping)
         phi *= factors
         log_rate *= factors
         backward(network, given, path_gradient=phi, log_rate_gradient=log_rate, out=self.architecture.split(out))
         return value.terms
+
+    def _pulled_back(self, rows: Rows, points: ControlPoints, value: LossValue) -> tuple[Array, Array]:
+        """Return the loss's gradients with respect to both heads, through the landing and the boundary conditions."""
+        by_path, by_rate = (
+            each.astype(points.path.dtype, copy=False) for each in (value.path_gradient, value.rate_gradient)
+        )
+        if self.landing is not None:
+            by_path = self.landing.pull_back(points.path, rows.tops, by_path)
+        scale = self.settings.path_scale
+        return pull_back(rows.tasks, points, path_gradient=by_path, rate_gradient=by_rate, scale=scale, spec=self.spec)
 
     def _landed(self, points: ControlPoints, rows: Rows) -> ControlPoints:
         if self.landing is None:

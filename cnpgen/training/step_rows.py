@@ -3,8 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.loader.order import Order
 
-class Order:
+
+class StepRows:
     """Batches of shuffled rows; every epoch has another order, what does not fill a batch is left out.
 
     Args:
@@ -17,12 +19,11 @@ class Order:
         self.batch_size = min(batch_size, rows)
         self.batches = rows // self.batch_size
         self._rows, self._seed, self._epoch = rows, seed, -1
-        self._order = np.empty(0, np.intp)
+        self._order: NDArray[np.int64] = np.empty(0, np.int64)
 
-    def batch(self, step: int) -> NDArray[np.intp]:
+    def batch(self, step: int) -> NDArray[np.int64]:
         """Return the rows of the batch of one step, shape (batch_size,)."""
         epoch, index = divmod(step, self.batches)
         if epoch != self._epoch:
-            random = np.random.Generator(np.random.Philox(key=[self._seed, epoch]))
-            self._epoch, self._order = epoch, random.permutation(self._rows)
+            self._epoch, self._order = epoch, Order("train", (self._rows,), self._seed, epoch).rows_of(0)
         return self._order[index * self.batch_size : (index + 1) * self.batch_size]

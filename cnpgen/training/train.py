@@ -1,22 +1,25 @@
 """Training a model on a dataset: a file in the end, a checkpoint and a log on the way."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arguments import integer
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.planner.kit import surroundings
+from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.planner.requests import problem_of
+from cnpgen.store.documents import plain
 from cnpgen.threads import one_thread
 from cnpgen.training.checkpoint import Checkpoints, differences
 from cnpgen.training.journal import Journal
+from cnpgen.training.places import CHECKPOINT, LOG, check_beside, check_out, sweep_beside
 from cnpgen.training.prepare import begin_run, identity, prepare_run
 from cnpgen.training.run import Run, Watcher
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.source import open_source
+from cnpgen.training.source import Source, open_source
 from cnpgen.training.state import State
 from cnpgen.training.validation import validate
 
@@ -31,7 +34,7 @@ class Trained:
     Attributes:
         model: The best model.
         path: Its file.
-        score: What ``validate`` says of it on the validation split, or its first 2,000 rows.
+        score: What ``validate`` says of it on up to 2,000 validation rows that it was not chosen by.
         made: Whether it was made now; False if it was there already.
     """
 
@@ -69,55 +72,73 @@ def train_model(
         cpu_seconds: How long, in CPU time of the steps [s]: how long a step takes is measured before, and their number
             is then fixed. If nothing says how long, 120 s.
         settings: How to train.
-        check_rows: Validation rows that models are compared by on the way; the last one sees up to 2,000.
+        check_rows: Validation rows that models are compared by on the way, half of them at most; the best one is judged
+            on up to 2,000 others.
         command: What the model says that it was made by.
-        force: Replace the model that is there; throw away what another run has left in its checkpoint.
+        force: Replace the model, log and picture that are there; throw away another run's checkpoint.
         workers: Processes of the last validation; training itself is one process.
         begin: Called once before the first step.
         watch: Called with every line of the log.
 
     Raises:
-        UsageError: An argument cannot be meant, or there is another model.
+        UsageError: An argument cannot be meant, or there is another model, or a log or picture of something else.
         DatasetError: The dataset or the checkpoint is damaged, or the checkpoint is of another run.
         MachineError: The disk is full, or the loss is not finite any more.
     """
-    if steps is None and epochs is None and cpu_seconds is None:
-        cpu_seconds = SECONDS
-    length = Length(steps=steps, epochs=epochs, cpu_seconds=cpu_seconds)
-    out, settings = _checked(Path(out)), settings or TrainingSettings()
-    source = open_source(folder)
-    lasts = {name: value for name, value in vars(length).items() if value is not None}
-    asked = {"length": lasts, "check_rows": check_rows}
-    checkpoints = Checkpoints(out.with_suffix(".checkpoint"), {**identity(source, settings), **asked})
-    if out.exists() and not checkpoints.path.exists() and not force:
-        return _finished(out, checkpoints.identity)
-    with one_thread(), surroundings(problem_of(source.dataset.plan)) as given:
-        run, kit = prepare_run(source, given, settings, check_rows=check_rows, command=command)
-        state = checkpoints.load(discard=force) or begin_run(run, length)
+    lasts = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
+    job = _job(folder, Path(out), settings or TrainingSettings(), lasts, check_rows)
+    if not force:
+        if job.out.exists() and not job.checkpoints.path.exists():
+            return _finished(job)
+        check_beside(job.out)
+    with one_thread(), surroundings(problem_of(job.source.dataset.plan)) as given:
+        run, kit = prepare_run(job.source, given, job.settings, check_rows=job.check_rows, command=command)
+        state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
         if begin is not None:
             begin(state, run)
-        journal = Journal(out.with_suffix(".jsonl"), state.adam.step)
-        run.go_on(state, checkpoints, journal, watch)
-        checkpoints.save(state)
-        held_out = source.boundary(source.validation, MOST_JUDGED)
-        score = validate(run.model(state.best.parameters), kit, held_out, workers=workers)
+        journal = Journal(job.out.with_suffix(LOG), state.log)
+        run.go_on(state, job.checkpoints, journal, watch)
+        job.checkpoints.save(state)
+        return _kept(job, run.model(state.best.parameters), kit, state, journal, workers)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is to be trained, on what, for how long, and where it goes."""
+
+    source: Source
+    out: Path
+    settings: TrainingSettings
+    length: Length
+    check_rows: int
+    checkpoints: Checkpoints
+
+
+def _job(folder: str | Path, out: Path, settings: TrainingSettings, lasts: Mapping[str, Any], check_rows: int) -> _Job:
+    """Check what was asked for, and open the dataset."""
+    given = {name: value for name, value in lasts.items() if value is not None} or {"cpu_seconds": SECONDS}
+    length, check_rows = Length(**given), integer("check_rows", check_rows, least=1)
+    check_out(out)
+    sweep_beside(out)
+    source = open_source(folder)
+    asked = {**identity(source, settings), "length": plain(given), "check_rows": check_rows}
+    return _Job(source, out, settings, length, check_rows, Checkpoints(out.with_suffix(CHECKPOINT), asked))
+
+
+def _kept(job: _Job, best: Model, kit: Kit, state: State, journal: Journal, workers: int | None) -> Trained:  # noqa: PLR0917
+    """Judge the best model and write it; the log's last line is not in the checkpoint, so that it comes but once."""
+    score = validate(best, kit, job.source.judged(MOST_JUDGED, after=job.check_rows), workers=workers)
     journal.write({"step": state.adam.step, "best": state.best.step, "final": score})
-    outcome = {**asked, **_outcome(state, score)}
-    model = run.model(state.best.parameters, log=journal.text, training=outcome)
-    save_model(out, model)
-    checkpoints.remove()
-    return Trained(model, out, score)
+    training = {**best.training, **job.checkpoints.identity, **_outcome(state, score)}
+    model = replace(best, log=journal.text, training=training)
+    save_model(job.out, model)
+    job.checkpoints.remove()
+    return Trained(model, job.out, score)
 
 
-def _checked(path: Path) -> Path:
-    if path.suffix != ".h5" or path.is_dir() or not path.parent.is_dir():
-        raise UsageError(f"{path} must be a file that ends in .h5, in a folder that exists")
-    return path
-
-
-def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
+def _finished(job: _Job) -> Trained:
     """Return the model that is there if it is the one that was asked for."""
-    hint = "train another file, or replace it with --force"
+    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with --force"
     try:
         model = load_model(path)
     except DatasetError as error:
