@@ -3,6 +3,7 @@
 import dataclasses
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from cnpgen import plugins
@@ -46,7 +47,7 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
         ("seed", str(recipe.seed)),
         ("licence", recipe.license),
         ("recipe", f"sha256 {recipe_digest(recipe)}"),
-        ("file", str(recipe.path)),
+        ("file", recipe.path),
     ]
     return "\n".join([f"dataset {recipe.name} {recipe.version}", *_title(recipe.title), *table(facts, indent="  ")])
 
@@ -216,12 +217,12 @@ def _noun(recipe: Recipe) -> str:
 
 
 def table(
-    rows: Sequence[Sequence[str]], *, indent: str = "", right: Sequence[int] = (), one_line: bool = False
+    rows: Sequence[Sequence[Any]], *, indent: str = "", right: Sequence[int] = (), one_line: bool = False
 ) -> list[str]:
     """Lay out rows as aligned columns that fit into ``WIDTH``.
 
     Args:
-        rows: The cells, in rows of the same length.
+        rows: The cells, in rows of the same length. A path in the last column stays in one piece, for scripts.
         indent: Put before every line.
         right: The columns that are aligned to the right.
         one_line: Whether to cut what does not fit into the last column; it is wrapped by default.
@@ -236,6 +237,13 @@ def table(
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))
         head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
-        parts = textwrap.wrap(last, room, break_on_hyphens=False, max_lines=1 if one_line else None, placeholder=" ...")
+        parts = [str(last)] if isinstance(last, Path) else _wrapped(last, room, one_line=one_line)
         lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
     return lines
+
+
+def _wrapped(text: str, room: int, *, one_line: bool) -> list[str]:
+    lines = 1 if one_line else None
+    return textwrap.wrap(
+        text, room, break_on_hyphens=False, break_long_words=one_line, max_lines=lines, placeholder=" ..."
+    )

@@ -413,7 +413,8 @@ def test_a_file_sees_a_single_line(capsys):
 def test_list_shows_everything_that_there_is(run):
     code, out, err = run("list")
     assert (code, err) == (0, "")
-    for text in ("airhockey-replan", "120,000 rows", "7 joints, 7 constraints", "goal-ik", "robot-clearance"):
+    models = "planner trained on airhockey-hit"
+    for text in ("airhockey-replan", "120,000 rows", models, "7 joints, 7 constraints", "goal-ik", "robot-clearance"):
         assert text in out
     assert max(len(line) for line in out.splitlines()) <= 100
 
@@ -421,7 +422,7 @@ def test_list_shows_everything_that_there_is(run):
 def test_list_can_be_narrowed_and_read_by_programs(run):
     assert "start-ik" not in run("list", "datasets")[1]
     found = json.loads(run("list", "--json")[1])
-    assert list(found) == ["datasets", "pipelines", "problems", "stages", "constraints"]
+    assert list(found) == ["datasets", "models", "pipelines", "problems", "stages", "constraints"]
     assert found["datasets"][0]["rows"] == 19_800
     assert Path(found["problems"][0]["file"]).is_file()
 

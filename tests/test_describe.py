@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 
@@ -138,6 +139,11 @@ def test_a_table_is_aligned_and_its_last_column_wraps():
     assert lines[1].startswith("  long  20  word word")
     assert lines[2].startswith(" " * 12 + "word")
     assert all(len(line) <= WIDTH for line in lines)
+
+
+def test_a_path_stays_in_one_piece_for_scripts():
+    path = Path("/a folder/" + 30 * "deeply/" + "recipe.toml")
+    assert table([("name", "x"), ("file", path)], indent="  ")[1] == f"  file  {path}"
 
 
 def test_a_table_can_cut_its_last_column_instead():

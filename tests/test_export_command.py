@@ -54,8 +54,8 @@ def test_an_archive_is_named_after_the_file_and_its_name_is_the_output(run: Run,
 def test_a_message_is_what_ros_expects_of_a_joint_trajectory(run: Run, hits: Path) -> None:
     plan = load("hit")
     code, out, _ = run(hits, "--to", "joint-trajectory", "--rate", 250, "--plan", "1")
-    assert (code, out) == (0, "hits\n")
-    (path,) = Path("hits").iterdir()
+    assert (code, out) == (0, "hits-joint-trajectory\n")
+    (path,) = Path("hits-joint-trajectory").iterdir()
     assert path.name == "plan_00001.json"
     message = json.loads(path.read_text(encoding="utf-8"))
     assert message["joint_names"] == list(plan.problem.robot.joints)
@@ -92,6 +92,13 @@ def test_what_is_there_is_replaced_only_by_force(run: Run, hits: Path) -> None:
         assert [path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()] != before
 
 
+def test_a_plan_that_is_not_there_is_named_before_the_place_is_looked_at(run: Run, hits: Path) -> None:
+    assert run(hits, "--to", "csv", "--plan", 0)[0] == 0
+    assert run(hits, "--to", "joint-trajectory", "--plan", 0)[0] == 0  # elsewhere
+    code, _, err = run(hits, "--to", "csv", "--plan", "0,7")
+    assert (code, err) == (2, "cnpgen: error: there is no plan 7: 4 plans are numbered from 0\n")
+
+
 def test_an_empty_folder_is_free(run: Run, hits: Path) -> None:
     Path("empty").mkdir()
     assert run(hits, "--to", "csv", "-o", "empty", "--plan", 0)[0] == 0
@@ -103,7 +110,7 @@ def test_plans_that_cannot_be_sampled_are_named_and_the_others_written(run: Run,
     cases = garbage()
     save_plans(tmp_path / "garbage.h5", plans_of(*(plan for plan, _ in cases.values())))
     code, out, err = run(tmp_path / "garbage.h5", "--to", "csv", "--rate", 50)
-    assert (code, out) == (1, "garbage\n")
+    assert (code, out) == (1, "garbage-csv\n")
     *left_out, last = err.splitlines()
     assert (
         "cnpgen: left out: plan 1 (sample 1): a boundary condition or a control point is not a finite number"
@@ -111,7 +118,7 @@ def test_plans_that_cannot_be_sampled_are_named_and_the_others_written(run: Run,
     )
     assert "cnpgen: left out: plan 2 (sample 2): the rate ds/dt is not positive throughout" in err
     assert last == f"exported {len(cases) - len(left_out)} plans of {len(cases)} at 50 Hz"
-    written = {path.name for path in Path("garbage").iterdir()}
+    written = {path.name for path in Path("garbage-csv").iterdir()}
     assert {"plan_00000.csv", "plan_00009.csv", "plan_00010.csv"} <= written
     assert len(written) == len(cases) - len(left_out)
 

@@ -42,8 +42,10 @@ def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tm
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL]) == 0
     captured = capsys.readouterr()
     assert captured.out == f"{path}\n"
-    for word in ("training", "valid", "of its budget (weight", "learning rate", "is kept"):
-        assert word in captured.err
+    said = " ".join(captured.err.split())
+    for word in ("training", "valid", "terms / budgets x weights: joint-position", "learning rate", "is kept"):
+        assert word in said
+    assert max(map(len, captured.err.splitlines())) <= 100
     assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert len(path.with_suffix(".jsonl").read_text().splitlines()) >= 40
     training = load_model(path).training
@@ -98,8 +100,32 @@ def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_pa
     assert (tmp_path / "m.checkpoint").exists()
 
 
+def test_the_command_in_a_model_is_the_one_that_was_given(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tiny("airhockey-hit"))
+    path = tmp_path / "my model.h5"
+    assert main(["train", ".", "-o", str(path), *SMALL, "--learning-rate", "0.00123456789", "--quiet"]) == 0
+    command = load_model(path).training["command"]
+    assert command.startswith("cnpgen train airhockey-hit -o 'my model.h5' --steps 40")
+    assert "--learning-rate 0.00123456789 " in command
+
+
+def test_growth_that_changes_nothing_is_refused(tiny, tmp_path, capsys):
+    words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), "--metric", "fixed", "--growth", "500"]
+    code, text = failing(capsys, words)
+    assert code == 2
+    assert "--growth changes nothing with --metric fixed" in text
+
+
 @pytest.mark.parametrize(
-    "words", [["--metric", "paper"], ["--steps", "0"], ["--steps", "5", "--epochs", "2"], ["--learning-rate", "-1"]]
+    "words",
+    [
+        ["--metric", "paper"],
+        ["--learning-rate", "inf"],
+        ["--growth", "inf"],
+        ["--steps", "0"],
+        ["--steps", "5", "--epochs", "2"],
+        ["--learning-rate", "-1"],
+    ],
 )
 def test_train_refuses_what_cannot_be_meant(tiny, tmp_path, capsys, words):
     code, text = failing(capsys, ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *words])
@@ -192,6 +218,32 @@ def test_a_file_of_boundary_conditions_is_planned_for_and_what_it_lacks_is_at_re
     again = tmp_path / "again.h5"  # a file of plans holds boundary conditions, too
     assert main(["plan", str(out), "--model", str(trained), "-o", str(again), "--quiet"]) == 0
     np.testing.assert_array_equal(load_plans(again).path_control_points, found.path_control_points)
+
+
+def test_a_shard_is_refused_as_its_folder_is_and_planned_for_with_other_rows(trained, tiny, tmp_path, capsys):
+    shard, out = tiny("airhockey-replan") / "train" / "shard-00000.h5", tmp_path / "p.h5"
+    words = ["plan", str(shard), "--model", str(trained), "-o", str(out)]
+    code, text = failing(capsys, words)
+    assert code == 1
+    assert "drawn in another way" in text
+    assert "start_dq was zero in every row" in failing(capsys, [*words, "--other-rows"])[1]
+    shard = tiny("airhockey-hit") / "train" / "shard-00001.h5"
+    assert main(["plan", str(shard), "--model", str(trained), "-o", str(out), "--quiet"]) == 0
+    assert load_plans(out).sample_id[0] == 250
+
+
+def test_what_a_model_cannot_plan_for_is_refused_before_kernels_are_made(trained, tiny, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("cnpgen.planner.planner.Planner.__init__", lambda *_, **__: pytest.fail("kernels were made"))
+    words = ["plan", str(tiny("heavy-object")), "--model", str(trained), "-o", str(tmp_path / "p.h5")]
+    assert "plans for 'airhockey'" in failing(capsys, words)[1]
+
+
+@pytest.mark.parametrize("name", ["plans.txt", "plans", "nowhere/plans.h5"])
+def test_plans_go_to_a_file_that_ends_as_models_do(trained, tiny, tmp_path, capsys, name):
+    words = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(tmp_path / name)]
+    code, text = failing(capsys, words)
+    assert code == 2
+    assert "in a folder that exists" in text
 
 
 def test_a_dataset_of_another_problem_is_refused_with_what_differs(trained, tiny, tmp_path, capsys):

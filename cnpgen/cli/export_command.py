@@ -29,7 +29,13 @@ def add(commands: "Commands[Parser]") -> None:
     option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
     option("--to", metavar="FORM", required=True, choices=FORMS, help="the form: npz, csv or joint-trajectory")
     option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
-    option("-o", "--out", metavar="PATH", type=Path, help="file (npz) or folder to write; default: named after FILE")
+    option(
+        "-o",
+        "--out",
+        metavar="PATH",
+        type=Path,
+        help="file (npz) or folder to write; default: named after FILE and FORM",
+    )
     option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
     option("--sample", metavar="I", type=values.numbers, help="the plans of these samples only, by sample_id")
     option("--force", action="store_true", help="replace files that are there")
@@ -40,8 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.export import export_plans
 
     plans = read_plans(arguments.file)
-    out = _place(arguments)
-    exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=_chosen(plans, arguments))
+    chosen, out = _chosen(plans, arguments), _place(arguments)
+    exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=chosen)
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
@@ -61,7 +67,7 @@ def _place(arguments: argparse.Namespace) -> Path:
     from cnpgen.errors import UsageError
 
     file: Path = arguments.file
-    out: Path = arguments.out or Path(f"{file.stem}.npz" if arguments.to == "npz" else file.stem)
+    out: Path = arguments.out or Path(f"{file.stem}.npz" if arguments.to == "npz" else f"{file.stem}-{arguments.to}")
     target = out / "plans.npz" if arguments.to == "npz" and out.is_dir() else out
     if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
         raise UsageError(f"{target} is there already; --force replaces what has the same name")
@@ -77,6 +83,8 @@ def _chosen(plans: "Plans", arguments: argparse.Namespace) -> list[int] | None:
     if arguments.plan is None and arguments.sample is None:
         return None
     chosen = set(arguments.plan or ())
+    if chosen and max(chosen) >= len(plans):
+        raise UsageError(f"there is no plan {max(chosen)}: {len(plans)} plans are numbered from 0")
     if arguments.sample is not None:
         missing = np.setdiff1d(arguments.sample, plans.sample_id)
         if missing.size:

@@ -1,14 +1,15 @@
-"""``cnpgen list``: the recipes that cnpgen ships, and the kinds of stages and constraints that recipes are made of."""
+"""``cnpgen list``: the recipes and models that cnpgen ships, and the kinds of stages and constraints for recipes."""
 
 import argparse
 from typing import Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
-WHAT = ("datasets", "pipelines", "problems", "stages", "constraints")
+WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints")
 
 _HOW = {
     "datasets": "cnpgen make-dataset NAME",
+    "models": "cnpgen plan DIR --model NAME -o PLANS",
     "pipelines": "cnpgen show NAME --kind pipeline",
     "problems": "cnpgen show NAME --kind problem",
     "stages": "cnpgen show --stage NAME",
@@ -18,7 +19,7 @@ _HOW = {
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "list", run, title="list datasets, pipelines, problems, stages and constraints")
+    parser = add_command(commands, "list", run, title=f"list {', '.join(WHAT[:-1])} and {WHAT[-1]}")
     parser.add_argument("what", nargs="?", choices=WHAT, metavar="WHAT", help=f"one of {', '.join(WHAT)}; default all")
     add_json(parser)
 
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def list_all(what: str) -> list[dict[str, Any]]:
-    """List the recipes of one kind, or the kinds of stages or constraints, each with its name, title and size.
+    """List the recipes of one kind, the models, or the kinds of stages or constraints, with name, title and size.
 
     Args:
         what: One of ``WHAT``.
@@ -43,7 +44,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
     groups = {"stages": plugins.STAGES, "constraints": plugins.CONSTRAINTS}
     if what in groups:
         return [{"name": name, "title": _summary(groups[what], name)} for name in plugins.names(groups[what])]
-    return {"datasets": _datasets, "pipelines": _pipelines, "problems": _problems}[what]()
+    return {"datasets": _datasets, "models": _models, "pipelines": _pipelines, "problems": _problems}[what]()
 
 
 def _datasets() -> list[dict[str, Any]]:
@@ -56,6 +57,17 @@ def _datasets() -> list[dict[str, Any]]:
         size = {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
         about = {"version": recipe.version, "pipeline": recipe.pipeline.name}
         entries.append({"name": name, "title": recipe.title, **about, **size, "file": file})
+    return entries
+
+
+def _models() -> list[dict[str, Any]]:
+    from cnpgen.planner.model_file import shipped_models
+
+    entries = []
+    for name, file in shipped_models().items():  # their names are those of datasets; reading them would load HDF5
+        count = file.stat().st_size
+        size = {"size": f"{count / 1e6:.1f} MB", "bytes": count}
+        entries.append({"name": name, "title": f"planner trained on {name}", **size, "file": file})
     return entries
 
 

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.refine_options import REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.wording import counted
 
 if TYPE_CHECKING:
-    from cnpgen.planner.planner import Planner
+    from cnpgen.planner.model import Model
     from cnpgen.planner.requests import Requests
     from cnpgen.plans import Plans
 
@@ -51,11 +52,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     import time
 
+    from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
 
     _check(arguments)
-    planner = Planner(arguments.model, slow_down=not arguments.no_slowing)
-    requests = _requests(arguments, planner)
+    model = load_model(arguments.model)
+    requests = _requests(arguments, model)
+    planner = Planner(model, slow_down=not arguments.no_slowing)
     begun = time.perf_counter()
     plans = planner.plan_batch(requests.boundary, sample_id=requests.sample_id, columns=requests.columns)
     seconds = time.perf_counter() - begun
@@ -76,6 +79,7 @@ def _check(arguments: argparse.Namespace) -> None:
     lost = [name for name in ("workers", "explain", *REFINING) if getattr(arguments, name) != default(name)]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} is for --refine, which is missing")
+    check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
 
 
@@ -91,7 +95,7 @@ def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
     return 0
 
 
-def _requests(arguments: argparse.Namespace, planner: "Planner") -> "Requests":
+def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.errors import UsageError
     from cnpgen.planner.request_files import read_file
     from cnpgen.planner.requests import read_rows
@@ -99,7 +103,7 @@ def _requests(arguments: argparse.Namespace, planner: "Planner") -> "Requests":
     if arguments.problems.is_dir():
         return read_rows(
             arguments.problems,
-            planner.model,
+            model,
             split=arguments.split or "validation",
             first=arguments.first or 0,
             n=arguments.n,
@@ -107,4 +111,4 @@ def _requests(arguments: argparse.Namespace, planner: "Planner") -> "Requests":
         )
     if arguments.split is not None or arguments.first is not None or arguments.n is not None:
         raise UsageError("--split, --first and --n are for the folder of a dataset, got a file")
-    return read_file(arguments.problems, planner.model, other=arguments.other_rows)
+    return read_file(arguments.problems, model, other=arguments.other_rows)

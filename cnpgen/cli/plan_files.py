@@ -1,4 +1,4 @@
-"""Files of plans as commands read them: without plans there is nothing to do."""
+"""Files of plans as commands read them, and what those that they write are called."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,3 +20,11 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
     if not len(plans):
         raise DatasetError(f"no plans in {path}")
     return plans
+
+
+def check_suffix(out: Path) -> None:
+    """Refuse a file for plans that does not end as they do."""
+    from cnpgen.errors import UsageError
+
+    if out.suffix != ".h5":
+        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")

@@ -1,6 +1,7 @@
 """``cnpgen train``: train a model on a dataset, or go on with one that was interrupted."""
 
 import argparse
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +19,9 @@ _TEXT = """\
 The loss is the problem's objective and its constraints along every motion; no demonstrations are needed. Beside the
 model there are a log, .jsonl, a picture of it, .png (if matplotlib is installed), and until it is finished a
 checkpoint: after Ctrl-C (exit code 130) or SIGTERM (143) the same command goes on where it was, after kill -9 or a
-full disk at most a minute before, and gives the bits that it would have given. The model that is kept is the best of
-ten that are judged on validation rows as by 'cnpgen evaluate'. Its file is printed on stdout. docs/training.md says
-how to choose.
+full disk at most a minute before, and gives the parameters that it would have given. The model that is kept is the
+best of ten, compared on validation rows as 'cnpgen evaluate' judges them; its score is that on others. Its file is
+printed on stdout. docs/training.md says how to choose.
 """
 
 
@@ -30,19 +31,28 @@ def add(commands: "Commands[Parser]") -> None:
     option = parser.add_argument
     option("folder", metavar="DIR", type=Path, help="the dataset")
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="where the model goes, .h5")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--cpu-seconds", metavar="S", type=values.seconds, help="how long to train (default: 2 min)")
-    length.add_argument("--steps", metavar="N", type=values.positive, help="likewise, in steps")
-    length.add_argument("--epochs", metavar="E", type=values.positive, help="likewise, in passes over all rows")
+    _add_length(parser)
+    _add_how(parser)
+    option("--check", metavar="N", type=values.positive, default=200, help="rows to compare by (default: 200)")
+    option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
+    option("--force", action="store_true", help="replace MODEL and the files beside it, another run's checkpoint too")
+    option("--quiet", action="store_true", help="no progress and no summary")
+
+
+def _add_length(parser: Parser) -> None:
+    option = parser.add_mutually_exclusive_group().add_argument
+    option("--cpu-seconds", metavar="S", type=values.seconds, help="how long to train (default: 2 min)")
+    option("--steps", metavar="N", type=values.positive, help="likewise, in steps")
+    option("--epochs", metavar="E", type=values.positive, help="likewise, in passes over all rows")
+
+
+def _add_how(parser: Parser) -> None:
+    option, metrics = parser.add_argument, ("ramped", "fixed", "learned", "bounded")
     option("--hidden", metavar="W", type=values.positive, help="width of the network's layers (default: 128)")
     option("--layers", metavar="L", type=values.positive, help="depth of its trunk (default: 5)")
     option("--batch-size", metavar="B", type=values.positive, help="rows per step (default: 64)")
     option("--learning-rate", metavar="X", type=float, help="largest learning rate of Adam (default: 1e-3)")
-    option(
-        "--metric",
-        choices=("ramped", "fixed", "learned", "bounded"),
-        help="weights of the constraints (default: ramped)",
-    )
+    option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
     option("--growth", metavar="X", type=float, help="by which factor ramped weights grow in the run (default: 30)")
     option(
         "--imitate",
@@ -52,10 +62,6 @@ def add(commands: "Commands[Parser]") -> None:
         " --certify (default: 0)",
     )
     option("--seed", metavar="S", type=values.seed, help="of the first parameters and the order of rows (default: 0)")
-    option("--check", metavar="N", type=values.positive, default=200, help="rows to validate on (default: 200)")
-    option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
-    option("--force", action="store_true", help="replace MODEL, and throw away another run's checkpoint")
-    option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -97,11 +103,14 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
 
 
 def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
+    from cnpgen.errors import UsageError
     from cnpgen.training.settings import METRICS, TrainingSettings
 
     names = ("hidden", "layers", "batch_size", "learning_rate", "seed")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     metric = METRICS[arguments.metric or "ramped"]
+    if arguments.growth is not None and metric.kind == "fixed":
+        raise UsageError("--growth changes nothing with --metric fixed, whose weights do not grow")
     given["metric"] = metric if arguments.growth is None else replace(metric, growth=arguments.growth)
     if arguments.imitate is not None:
         given["imitation"] = arguments.imitate
@@ -113,12 +122,10 @@ def _command(arguments: argparse.Namespace) -> str:
     lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
     names = (*lengths, *network, "metric", "growth", "imitate", "seed", "check")
     default = arguments.parser.get_default
-    said = [(name.replace("_", "-"), getattr(arguments, name)) for name in names]
-    said = [(name, value) for name, value in said if value != default(name)]
-    options = [
-        f"--{name} {value:g}" if isinstance(value, float) else f"--{name} {value}" for name, value in said if value
-    ]
-    return " ".join(["cnpgen train", arguments.folder.name, "-o", arguments.out.name, *options])
+    said = [(name, getattr(arguments, name)) for name in names]
+    options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
+    places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]
+    return " ".join(["cnpgen train", places[0], "-o", places[1], *options])
 
 
 def _draw(trained: "Trained") -> None:

@@ -1,6 +1,7 @@
 """What ``cnpgen train`` says: a bar, a line per validation, a summary."""
 
 import sys
+import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from cnpgen.training.train import Trained
 
 
+WIDTH = 100  # of a line
 OFTEN = 100  # passes over the same rows after which more rows help more
 
 
@@ -44,9 +46,8 @@ class Watch:
         if "loss" in record:
             self._seen = record
         if "validation" in record and not self._quiet:
-            print(f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}", file=sys.stderr)
-            if self._seen:
-                print(f"  {_terms(self._seen)}", file=sys.stderr, flush=True)
+            text = _fitted(f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}")
+            print("\n".join([text, *([_terms(self._seen)] if self._seen else [])]), file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Remove the bar."""
@@ -65,12 +66,14 @@ def _words(found: Mapping[str, Any]) -> str:
 
 def _terms(record: Mapping[str, Any]) -> str:
     """Say how large the terms are, as multiples of their budgets where they have one, and their weights."""
-    words = [f"loss {record['loss']:.4g}, learning rate {record['learning_rate']:.2g}"]
+    words = []
     for name, weight in record["weights"].items():
         value, budget = record["terms"][name], record["budgets"][name]
-        against = f"{value / budget:.2g} of its budget" if budget else f"{value:.2g}"
-        words.append(f"{name} {against} (weight {weight:.2g})")
-    return ", ".join(words)
+        words.append(
+            f"{name} {value / budget:.2g} x {weight:.2g}" if budget else f"{name} ({value:.2g}) x {weight:.2g}"
+        )
+    head = f"loss {record['loss']:.4g}, learning rate {record['learning_rate']:.2g}; terms / budgets x weights: "
+    return _fitted("  " + head + ", ".join(words))
 
 
 def summary(trained: "Trained") -> str:
@@ -78,8 +81,15 @@ def summary(trained: "Trained") -> str:
     training = trained.model.training
     words = _words(trained.score)
     if not trained.made:
-        return f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
-    return (
+        return _fitted(
+            f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
+        )
+    return _fitted(
         f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time; the model of step"
         f" {training['best_step']:,} is kept: {words}"
     )
+
+
+def _fitted(text: str) -> str:
+    """Wrap a line to ``WIDTH``."""
+    return "\n".join(textwrap.wrap(text, WIDTH, subsequent_indent="    ", break_on_hyphens=False))
