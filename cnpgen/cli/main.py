@@ -54,7 +54,7 @@ examples:
   cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
   cnpgen validate airhockey-hit-v1 --deep            prove that they are right
   cnpgen train airhockey-hit-v1 -o hits.h5           train a planner: two minutes
-  cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5
+  cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5; a shipped one: --model airhockey-hit
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
