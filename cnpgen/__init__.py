@@ -14,18 +14,24 @@ if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation, evaluate_plans
     from cnpgen.export.plans import export_plans
     from cnpgen.inspection import inspect_dataset
+    from cnpgen.interop.omega import Omega
     from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, load_problem
     from cnpgen.loader.load import load_dataset
+    from cnpgen.losses.margins import Margins
+    from cnpgen.losses.metric import Metric
     from cnpgen.losses.plan_loss import PlanLoss
+    from cnpgen.losses.quadrature import rotating_shift
+    from cnpgen.losses.schedule import suggested_weights
     from cnpgen.make import make_dataset
     from cnpgen.planner.model_file import load_model
-    from cnpgen.planner.planner import Planner
+    from cnpgen.planner.planner import Planner, states_at
     from cnpgen.plans.load import load_plans
     from cnpgen.plans.plans import Plans, make_plans
     from cnpgen.plans.save import save_plans
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.proof import explain_plans
     from cnpgen.refinement import Refinement, refine_plans
+    from cnpgen.robots.obstacles import obstacle_tops
     from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.reader import open_dataset
     from cnpgen.training.settings import TrainingSettings
@@ -41,7 +47,10 @@ _HOME = {
     "DatasetError": "errors",
     "Evaluation": "evaluation",
     "MachineError": "errors",
+    "Margins": "losses.margins",
+    "Metric": "losses.metric",
     "Motion": "trajectory.motion",
+    "Omega": "interop.omega",
     "PlanLoss": "losses.plan_loss",
     "Planner": "planner.planner",
     "Plans": "plans.plans",
@@ -67,9 +76,13 @@ _HOME = {
     "load_problems": "solving",
     "make_dataset": "make",
     "make_plans": "plans.plans",
+    "obstacle_tops": "robots.obstacles",
     "open_dataset": "store.reader",
     "refine_plans": "refinement",
+    "rotating_shift": "losses.quadrature",
     "save_plans": "plans.save",
+    "states_at": "planner.planner",
+    "suggested_weights": "losses.schedule",
     "train_model": "training.train",
     "validate_dataset": "validation",
 }
@@ -80,7 +93,10 @@ __all__ = [
     "DatasetError",
     "Evaluation",
     "MachineError",
+    "Margins",
+    "Metric",
     "Motion",
+    "Omega",
     "PlanLoss",
     "Planner",
     "Plans",
@@ -107,9 +123,13 @@ __all__ = [
     "load_problems",
     "make_dataset",
     "make_plans",
+    "obstacle_tops",
     "open_dataset",
     "refine_plans",
+    "rotating_shift",
     "save_plans",
+    "states_at",
+    "suggested_weights",
     "train_model",
     "validate_dataset",
 ]

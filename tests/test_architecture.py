@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from graphlib import TopologicalSorter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -23,8 +24,9 @@ LAYERS = (
     ("pipelines",),
     ("store", "trajectory", "verify"),
     ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
-    ("interop", "certification"),
+    ("certification",),
     ("network", "planner"),
+    ("interop",),
     ("make_shard", "make_plan", "make"),
     ("consistency", "shard_checks", "deep_check", "regeneration"),
     ("validation", "inspection", "describe", "plots", "doctor"),
@@ -99,6 +101,16 @@ def test_a_module_imports_only_its_own_layer_and_those_above(module: Path) -> No
             assert layer(target) <= own, f"cnpgen.{name(module)} imports cnpgen.{target} of a later layer"
 
 
+def test_the_layers_of_the_docs_are_these() -> None:
+    page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    block = page.split("## Who may import whom")[1].split("```")[1]
+    lines = [line.split("  ")[0].split(", ") for line in block.splitlines() if line.strip() and line[0] != " "]
+    named = [module for line in lines for module in line]
+    assert {*named, "__main__", "__init__"} == {module for row in LAYERS for module in row}
+    for above, below in pairwise(lines):
+        assert max(map(layer, above)) <= min(map(layer, below)), f"{above} stand above {below}"
+
+
 @pytest.mark.parametrize("part", APART)
 def test_a_judge_shares_no_code_with_what_it_judges(part: str) -> None:
     for module in MODULES:
@@ -123,7 +135,8 @@ def test_no_module_imports_a_heavy_library_at_its_top(module: Path) -> None:
 def test_only_the_bridge_of_a_framework_imports_it() -> None:
     for module in MODULES:
         found = {imported.split(".")[0] for imported in imports(module)} & set(FRAMEWORKS)
-        assert found <= ({module.name} if within(name(module), "interop") else set()), f"{name(module)} imports {found}"
+        own = {framework for framework in FRAMEWORKS if within(name(module), f"interop.{framework}")}
+        assert found <= own, f"{name(module)} imports {found}"
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,9 @@ class Batches:
         cut: How they are dealt out.
         position: Where to begin.
 
+    Attributes:
+        times_set: How often the position was set since, by ``epoch`` or ``load_state``.
+
     Raises:
         UsageError: There are fewer rows than one batch needs, or in the last batch than there are ranks.
     """
@@ -44,6 +47,7 @@ class Batches:
         cut.check_ranks(source.rows, first=position.row)
         self._source, self._form, self._cut, self._position = source, form, cut, position
         self._kept: Kept | None = None
+        self.times_set = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_kept": None}
@@ -56,6 +60,7 @@ class Batches:
     @epoch.setter
     def epoch(self, epoch: int) -> None:
         self._position = replace(self._position, epoch=integer("epoch", epoch, least=0), row=0)
+        self.times_set += 1
 
     @property
     def signature(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
@@ -139,7 +144,10 @@ class Batches:
         position = self._forward(position_from_json(state, self._source))
         self._cut.check_ranks(self._source.rows, first=position.row)
         self._position = position
+        self.times_set += 1
 
-    def for_worker(self, worker: int, workers: int) -> "Batches":
-        """Return the part of one of several workers, which take the batches from here on in turn."""
-        return Batches(self._source, self._form, replace(self._cut, worker=worker, workers=workers), self._position)
+    def for_worker(self, worker: int, workers: int, *, epoch: int | None = None) -> "Batches":
+        """Return the part of one of several workers, which take the batches from here on, or of an epoch, in turn."""
+        cut = replace(self._cut, worker=worker, workers=workers)
+        position = self._position if epoch is None else replace(self._position, epoch=epoch, row=0)
+        return Batches(self._source, self._form, cut, position)

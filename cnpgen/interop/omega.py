@@ -1,0 +1,191 @@
+"""The paper's Omega block of one problem, for networks of any framework: from their outputs to control points and back.
+
+What boundary conditions, line and expected time make of a network's outputs, on the host and in float64.
+"""
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.arguments import integer, number
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
+from cnpgen.library import problem_of
+from cnpgen.losses.plan_batch import real_array
+from cnpgen.network import omega
+from cnpgen.network.omega import ControlPoints
+from cnpgen.network.tasks import Tasks
+from cnpgen.planner.curves import FIXED_AT_GOAL
+from cnpgen.planner.expressions import count_equalities
+from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.preparation import Preparation, prepare_tasks
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.recipes import Problem
+from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.robots.robot import load_robot
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+
+class Omega:
+    """Control points that meet boundary conditions exactly, from what a network says of a task, and gradients back.
+
+    Interior path control points are those of the line from start to goal plus ``path_scale`` times the network's
+    ``phi``; rates are ``exp(log_rate)`` over the expected time; the others follow (paper, Appendix A). Where a problem
+    has equalities, line and path are bent onto them, in zero steps in the paper.
+
+    Args:
+        problem: The problem, or its name or file.
+        path_scale: What phi is a multiple of [rad]; pi in the paper.
+        bending_steps: Gauss-Newton steps that bend the line.
+        landing_steps: Gauss-Newton steps that bend the path.
+        backend: Which kernels run; by default the fastest that works here.
+        cache_folder: Where kernels are kept; by default where all are.
+
+    Attributes:
+        problem: The problem.
+        path_outputs: Width of phi: interior control points times joints.
+        rate_outputs: Width of log_rate: control points of the rate.
+
+    Raises:
+        UsageError: An argument is none of what it may be.
+        MachineError: The backend that was asked for does not work here.
+    """
+
+    def __init__(
+        self,
+        problem: Problem | str | Path,
+        *,
+        path_scale: float = 0.5,
+        bending_steps: int = 1,
+        landing_steps: int = 1,
+        backend: Backend | None = None,
+        cache_folder: str | Path | None = None,
+    ) -> None:
+        self.problem, self._scale = problem_of(problem), number("path_scale", path_scale)
+        self._bending = integer("bending_steps", bending_steps, least=0)
+        self._landed = integer("landing_steps", landing_steps, least=0)
+        spec = self.problem.trajectory
+        self.path_outputs = (spec.path_control_points - 3 - FIXED_AT_GOAL) * len(self.problem.robot.joints)
+        self.rate_outputs = spec.rate_control_points
+        chosen, folder = choose_backend(backend)
+        folder = folder if cache_folder is None else Path(cache_folder)
+        arguments = {"robot": load_robot(self.problem), "problem": self.problem}
+        self._kernels = KernelLibrary(chosen, folder, problem_identity(self.problem), arguments)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was built for this process; it is built again when it is needed."""
+        return {name: part for name, part in vars(self).items() if name != "_built"}
+
+    @cached_property
+    def _built(self) -> tuple[Preparation, Landing | None]:
+        robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
+        bent = count_equalities(robot, problem) > 0
+        with kernels.compiling_together():
+            prepare = prepare_tasks(problem, robot, kernels, bending_steps=self._bending if bent else 0)
+            return prepare, make_landing(problem, kernels, steps=self._landed) if bent and self._landed else None
+
+    def tasks(self, boundary: Boundary) -> Tasks:
+        """Prepare N tasks: what follows from their boundary conditions before any network runs.
+
+        Args:
+            boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU. The acceleration at the
+                goal is free.
+
+        Raises:
+            UsageError: A shape is wrong, something is no real number, or the goal's acceleration is given.
+        """
+        given = dict(vars(boundary))
+        if given.pop("goal_ddq") is not None:
+            raise UsageError("goal accelerations are left free, so goal_ddq must be None")
+        arrays = {name: real_array(name, values, "float64") for name, values in given.items()}
+        shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
+        for name, array in arrays.items():
+            if array.shape != shape:
+                raise UsageError(f"{name} must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}")
+        return self._built[0](Boundary(**arrays))
+
+    def tops(self, tasks: Tasks) -> Array:
+        """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""
+        return obstacle_tops(self.problem, tasks.start_xyz, tasks.goal_xyz)
+
+    def __call__(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
+        """Compute control points, in float64.
+
+        Args:
+            tasks: N tasks.
+            phi: The network's say on the path, shape (N, path_outputs); shipped networks end in tanh.
+            log_rate: Its say on the rate, shape (N, rate_outputs).
+
+        Raises:
+            UsageError: A shape is wrong, or something is no real number.
+        """
+        points, landing = self._before_landing(tasks, phi, log_rate), self._built[1]
+        return points if landing is None else replace(points, path=landing.land(points.path, self.tops(tasks)))
+
+    def pull_back(
+        self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
+    ) -> tuple[Array, Array]:
+        """Turn gradients with respect to control points into those with respect to the network's outputs.
+
+        Where control points have overflowed and a finite gradient comes back, 0 is passed on: no plan touches another.
+
+        Args:
+            tasks: As for the control points.
+            phi: Likewise.
+            log_rate: Likewise.
+            path_gradient: Gradient with respect to the path control points, shape (N, C, n).
+            rate_gradient: Likewise to those of the rate, shape (N, R).
+
+        Returns:
+            Gradients with respect to phi and log_rate.
+        """
+        points, landing = self._before_landing(tasks, phi, log_rate), self._built[1]
+        with np.errstate(all="ignore"):
+            by_path = landing.pull_back(points.path, self.tops(tasks), path_gradient) if landing else path_gradient
+            spec = self.problem.trajectory
+            found = omega.pull_back(
+                tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self._scale, spec=spec
+            )
+        lost = _finite(path_gradient, rate_gradient) & ~_finite(*found)
+        for each in found:
+            each[lost] = 0
+        return found
+
+    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> Plans:
+        """Make plans of what a network says, to be evaluated, refined or saved."""
+        points = self(tasks, phi, log_rate)
+        return make_plans(
+            self.problem,
+            tasks.boundary,
+            path_control_points=points.path,
+            rate_control_points=points.rate,
+            columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+        )
+
+    def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:
+        """Refuse outputs by their shapes alone.
+
+        Raises:
+            UsageError: A shape is wrong.
+        """
+        for name, shape, width in (("phi", phi, self.path_outputs), ("log_rate", log_rate, self.rate_outputs)):
+            if shape != (len(tasks), width):
+                raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
+
+    def _before_landing(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
+        phi, log_rate = real_array("phi", phi, "float64"), real_array("log_rate", log_rate, "float64")
+        self.check_shapes(tasks, phi.shape, log_rate.shape)
+        with np.errstate(all="ignore"):
+            return omega.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)
+
+
+def _finite(*arrays: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether all numbers of a row are finite, shape (N,)."""
+    found = [np.isfinite(array).reshape(len(array), -1).all(axis=1) for array in arrays]
+    return np.asarray(np.all(found, axis=0))

@@ -1,0 +1,98 @@
+"""Batches as tensors on NumPy's memory, alone and through a ``DataLoader``."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torch.utils import data
+from torch.utils.data._utils.collate import default_collate_fn_map
+
+from cnpgen.errors import UsageError
+from cnpgen.loader.batch import Batch
+from cnpgen.loader.batches import Batches
+from cnpgen.loader.columns import Columns
+
+MOST_WORKERS = 1024
+
+
+class TensorBatch(dict[str, torch.Tensor]):
+    """A batch as tensors, by field; those of numbers are views of one packed table.
+
+    Args:
+        table: The fields of numbers side by side, shape (B, D).
+        layout: Which fields there are and where.
+        integers: The fields of integers, shape (B, width) or (B,).
+
+    Attributes:
+        table: The packed table: what a network that wants everything side by side takes.
+        layout: Which fields there are and where.
+    """
+
+    def __init__(self, table: torch.Tensor, layout: Columns, integers: Mapping[str, torch.Tensor]) -> None:
+        parts = {name: part.start if name in layout.scalars else part for name, part in layout.slices.items()}
+        names = (field.name for field in layout.fields)
+        super().__init__({name: table[:, parts[name]] if name in parts else integers[name] for name in names})
+        self.table, self.layout = table, layout
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Field name -> its columns of the table."""
+        return self.layout.slices
+
+    def to(self, device: torch.device | str | int, *, non_blocking: bool = False) -> "TensorBatch":
+        """Bring a batch to a device: the table in one transfer, and views of it there."""
+        there = {"device": device, "non_blocking": non_blocking}
+        integers = {field.name: self[field.name].to(**there) for field in self.layout.integers}
+        return TensorBatch(self.table.to(**there), self.layout, integers)
+
+
+def to_torch(batch: Batch) -> TensorBatch:
+    """Give a batch as tensors on its own memory."""
+    integers = {name: torch.from_numpy(values) for name, values in batch.integers.items()}
+    return TensorBatch(torch.from_numpy(batch.table), batch.layout, integers)
+
+
+def _refuse_batch(*_: Any, **__: Any) -> None:
+    raise UsageError("these are batches already: give the DataLoader of a BatchDataset batch_size=None")
+
+
+default_collate_fn_map[TensorBatch] = _refuse_batch  # else torch would stack batches, one by one, to shape (1, B, ...)
+
+
+class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
+    """Batches for a ``DataLoader(..., batch_size=None)``: every loop gives the rest of an epoch.
+
+    With DataLoader workers the order is the same, and every loop begins the next epoch, also after one that was left
+    early. As each worker reads all shards, they cost more than they bring.
+
+    Args:
+        batches: What ``dataset.batches(...)`` returned.
+    """
+
+    def __init__(self, batches: Batches) -> None:
+        super().__init__()
+        self.batches = batches
+        # Workers have copies of the position, which may end with them. So each notes in shared memory which epoch it
+        # has to give next, and how often the position had been set when it did: a position set later counts instead.
+        self._next = torch.full((MOST_WORKERS, 2), -1).share_memory_()
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[TensorBatch]:
+        worker = data.get_worker_info()
+        if worker is None:
+            return map(to_torch, self.batches)
+        mine, batches = self._next[worker.id], self.batches
+        epoch, times_set = mine.tolist()
+        if epoch in {-1, batches.epoch} or times_set not in {-1, batches.times_set}:
+            epoch = None
+        part = batches.for_worker(worker.id, worker.num_workers, epoch=epoch)
+        mine.copy_(torch.tensor([part.epoch + 1, batches.times_set]))
+        return map(to_torch, part)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Begin an epoch, here and in all workers; where it is the present one, go on in it."""
+        if self.batches.epoch != epoch:
+            self.batches.epoch = epoch
+        self._next.copy_(torch.tensor([epoch, -1]))
