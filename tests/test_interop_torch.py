@@ -287,8 +287,18 @@ def test_a_second_derivative_is_refused(loss: Any) -> None:
     of, given = loss("airhockey"), plans("airhockey", 2)
     path = given.pop("path").requires_grad_()
     (by_path,) = torch.autograd.grad((plan_loss(of, path, **given)[0] ** 2).sum(), [path], create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
+    with pytest.raises(UsageError, match="gradients of gradients of the loss"):
         by_path.sum().backward()
+    first = torch.func.grad(lambda path: (plan_loss(of, path, **given)[0] ** 2).sum())
+    with pytest.raises(UsageError, match="gradients of gradients of the loss"):
+        torch.func.grad(lambda path: first(path).sum())(path.detach())
+
+
+def test_a_gradient_of_the_weights_alone_is_the_terms(loss: Any) -> None:
+    of, given = loss("airhockey"), plans("airhockey", 3)
+    total, terms = plan_loss(of, **given | {"weights": given["weights"].requires_grad_()})
+    total.sum().backward()
+    torch.testing.assert_close(given["weights"].grad, terms[:, 1:].sum(0))
 
 
 def test_a_plan_that_is_none_touches_no_other_through_autograd(loss: Any) -> None:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch.autograd.function import once_differentiable
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.host import evaluate
@@ -109,18 +108,32 @@ class _PlanLoss(torch.autograd.Function):  # type: ignore[misc]
         ctx.save_for_backward(total, *slopes)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, by_total: torch.Tensor, *_: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        total, by_path, by_rate, by_weights = ctx.saved_tensors
-        path, rate, weights = ctx.needs_input_grad[2:]
-        scale = torch.where(total.isfinite(), by_total, 0)
-        return (
-            None,
-            None,
-            by_path * scale[:, None, None] if path else None,
-            by_rate * scale[:, None] if rate else None,
-            (by_weights * scale[:, None]).sum(0) if weights else None,
-        )
+        return None, None, *_Scaled.apply(by_total, *ctx.saved_tensors)
+
+
+class _Scaled(torch.autograd.Function):  # type: ignore[misc]
+    """The backward pass; ``once_differentiable`` would let ``torch.func`` take gradients of gradients to be zero."""
+
+    @staticmethod
+    def forward(
+        by_total: torch.Tensor,
+        total: torch.Tensor,
+        by_path: torch.Tensor,
+        by_rate: torch.Tensor,
+        by_weights: torch.Tensor,
+    ) -> tuple[torch.Tensor, ...]:
+        scale = torch.where(total.isfinite(), by_total, 0)[:, None]
+        wanted = scale[: len(by_path)]
+        return by_path * wanted[..., None], by_rate * wanted, (by_weights * scale).sum(0)
+
+    @staticmethod
+    def setup_context(*_: Any) -> None:
+        """Nothing is kept."""
+
+    @staticmethod
+    def backward(_: Any, *__: torch.Tensor) -> None:
+        raise UsageError("gradients of gradients of the loss are not available")
 
 
 class _OnHost(torch.autograd.Function):  # type: ignore[misc]
