@@ -27,17 +27,16 @@ from slsqp import minimise_slsqp
 
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.problem import open_problem
-from cnpgen.refine.bounds import BoundsTemplate
-from cnpgen.refine.engine import _tasks, load_refiner, prepare
+from cnpgen.refine.engine import load_refiner, prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.proof import explain_plans
-from cnpgen.refine.refiner import Passes, Refiner
+from cnpgen.refine.refiner import Passes, Refiner, default_passes
+from cnpgen.refine.sqp import Settings
 from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems
 from cnpgen.threads import one_thread
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verify.world import World
 
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")
 SMALL = {"fresh": (60, 60, 20), "ipopt": 4, "height": 30, "slsqp": 2, "workers": 100}
@@ -191,22 +190,16 @@ def spread(ratios: Any) -> str:
 def wide_band(problems: Plans) -> Refiner:
     """A refiner that lets the tip use most of the tolerance of its height."""
     problem, robot = open_problem(problems.problem)
-    tool, world = load_refiner(problem, robot), World(problem, robot)
-    wider = {
-        name: replace(each, tightening=replace(each.tightening, band=0.9)) for name, each in vars(tool.passes).items()
-    }
-    tool.passes = Passes(**wider)
-    tool._bounds = {
-        each: BoundsTemplate(problem, world, tool._grids[each.points].s, each.tightening) for each in wider.values()
-    }
-    return tool
+    usual = default_passes(problem, Settings())
+    wider = {name: replace(each, tightening=replace(each.tightening, band=0.9)) for name, each in vars(usual).items()}
+    return load_refiner(problem, robot, passes=Passes(**wider))
 
 
 def off_height(problems: Plans, found: list[Made]) -> list[float]:
     """How far the tips of valid plans are off the table's height at most, beyond the funnel of the start [m]."""
     problem, robot = open_problem(problems.problem)
     jury = Jury(problem, robot, degree=problems.degree)
-    pairs = zip(_tasks(problems, problem), found, strict=True)
+    pairs = zip(tasks_of(problems), found, strict=True)
     verdicts = [jury.verdict(task, each.refined.path, each.refined.rate) for task, each in pairs if each.valid]
     return [each.margins["table height"].excess for each in verdicts]
 
@@ -215,9 +208,9 @@ def run_slsqp(refiner: Refiner, plans: Plans, cap: float) -> tuple[list[bool], l
     """Solve plans with SLSQP; return which are valid and the CPU times [s]."""
     problem, robot = open_problem(plans.problem)
     jury, valid, seconds = Jury(problem, robot, degree=plans.degree), [], []
-    for task in _tasks(plans, problem):
+    for task in tasks_of(plans):
         given = refiner.given(task)
-        x = refiner._straight(task) if given is None else given.x
+        x = refiner.straight(task) if given is None else given
         end, took = minimise_slsqp(refiner, task, x, cap=cap)
         path, rate = refiner.check.transcription(task).unpack(end)
         forward = bool(Motion(path[None], rate[None], plans.degree).runs_forward()[0])

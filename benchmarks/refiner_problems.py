@@ -14,7 +14,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stage import Batch
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.problem import open_problem, record_problem
-from cnpgen.refine.engine import _tasks, prepare
+from cnpgen.refine.engine import prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
@@ -73,7 +73,7 @@ def make_each(plans: Plans, options: RefineOptions, refiner: Refiner | None = No
     tool = prepare(plans, options) if refiner is None else refiner
     problem, robot = open_problem(plans.problem)
     jury = WatchedJury(problem, robot, degree=plans.degree)
-    tasks = _tasks(plans, problem)
+    tasks = tasks_of(plans)
     refine_task(tool, jury, tasks[0])  # warms up
     return [_make(tool, jury, task) for task in tasks]
 

@@ -75,7 +75,7 @@ def minimise_slsqp(refiner: Refiner, task: Task, x: Array, *, cap: float) -> tup
 
     which, start = refiner.passes.first, time.process_time()
     motion = refiner.transcription(task, which)
-    bounds = refiner._bounds[which].of(task.start_xyz, ends=motion.end_residuals())
+    bounds = refiner.bounds(task, which, motion.end_residuals())
     function = Function(motion, bounds, start + cap)
     try:
         with np.errstate(all="ignore"):

@@ -80,9 +80,9 @@ def test_a_programme_holds_what_it_is_told_and_its_sparse_jacobian_is_the_dense_
 def test_casadis_solvers_end_at_least_as_good_as_the_own_one(solver: str) -> None:
     asked, tool = task(load("hit")), refiner("airhockey")
     which = tool.passes.first
-    own = tool.minimise(asked, which, tool._straight(asked))
+    own = tool.minimise(asked, which, tool.straight(asked))
     motion, bounds = tool.transcription(asked, which), tool._bounds[which].of(asked.start_xyz)
-    other = minimise_with(motion, bounds, tool._straight(asked), Settings(), solver=solver)
+    other = minimise_with(motion, bounds, tool.straight(asked), Settings(), solver=solver)
     assert bounds.violation(motion.value(other.x)[1]) == pytest.approx(other.violation, abs=1e-12)  # another kernel
     assert other.violation < Settings().violation_tolerance
     assert other.cost < own.cost * 1.001
@@ -103,7 +103,7 @@ def test_an_interruption_inside_a_plug_in_is_not_lost(solver: str, monkeypatch: 
 
     monkeypatch.setattr(motion, "evaluate", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        minimise_with(motion, tool._bounds[which].of(asked.start_xyz), tool._straight(asked), Settings(), solver=solver)
+        minimise_with(motion, tool._bounds[which].of(asked.start_xyz), tool.straight(asked), Settings(), solver=solver)
     assert len(calls) == 7  # and nothing was evaluated afterwards
 
 
@@ -112,7 +112,7 @@ def test_an_interruption_inside_a_plug_in_is_not_lost(solver: str, monkeypatch: 
 def test_a_signal_is_not_lost_wherever_it_comes(solver: str, seconds: float) -> None:
     asked, tool = task(load("hit")), refiner("airhockey")
     which = tool.passes.first
-    motion, bounds, x = tool.transcription(asked, which), tool._bounds[which].of(asked.start_xyz), tool._straight(asked)
+    motion, bounds, x = tool.transcription(asked, which), tool._bounds[which].of(asked.start_xyz), tool.straight(asked)
     endless = Settings(max_iterations=100_000, cost_tolerance=1e-300)
     timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
@@ -143,7 +143,7 @@ def test_a_callback_that_failed_once_is_not_called_again() -> None:
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_steps_into_what_is_no_number_are_taken_back(solver: str) -> None:
     asked, tool = task(load("transport")), refiner("heavy-object")
-    which, x = tool.passes.first, tool._straight(asked)
+    which, x = tool.passes.first, tool.straight(asked)
     bounds = tool._bounds[which].of(asked.start_xyz)
     nowhere = Bounds(bounds.lower + 50.0, bounds.upper + 50.0, bounds.sharp)  # contradicts itself
     settings = Settings(max_iterations=1)
@@ -155,7 +155,7 @@ def test_steps_into_what_is_no_number_are_taken_back(solver: str) -> None:
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_without_iterations_the_first_variables_come_back(solver: str) -> None:
     asked, tool = task(load("hit")), refiner("airhockey")
-    which, x = tool.passes.first, tool._straight(asked)
+    which, x = tool.passes.first, tool.straight(asked)
     bounds = tool._bounds[which].of(asked.start_xyz)
     result = minimise_with(tool.transcription(asked, which), bounds, x, Settings(max_iterations=0), solver=solver)
     np.testing.assert_array_equal(result.x, x)

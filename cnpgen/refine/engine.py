@@ -14,7 +14,7 @@ from cnpgen.refine.criterion import choose_criterion
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.polish import refine_task
-from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.refiner import Passes, Refiner
 from cnpgen.refine.sqp import Settings
 from cnpgen.refine.task import Refined, Task
 from cnpgen.robots.obstacles import obstacle_tops
@@ -34,9 +34,8 @@ def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
         options: How to.
     """
     refiner = prepare(plans, options)
-    problem, robot = open_problem(plans.problem)
-    jury = Jury(problem, robot, degree=plans.degree, step=options.step)
-    return [refine_task(refiner, jury, task) for task in _tasks(plans, problem)]
+    jury = _jury(plans.problem, plans.degree, options.step)
+    return [refine_task(refiner, jury, task) for task in tasks_of(plans)]
 
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:
@@ -49,7 +48,9 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     return _refiner(plans.problem, spec, options)
 
 
-def _tasks(plans: Plans, problem: "Problem") -> list[Task]:
+def tasks_of(plans: Plans) -> list[Task]:
+    """Return the boundary problem of every plan, with its control points as a start."""
+    problem, _ = open_problem(plans.problem)
     starts, goals = plans.columns["start_xyz"], plans.columns["goal_xyz"]
     tops = obstacle_tops(problem, starts, goals)
     return [
@@ -59,13 +60,23 @@ def _tasks(plans: Plans, problem: "Problem") -> list[Task]:
 
 
 @lru_cache(maxsize=2)
+def _jury(record: ProblemRecord, degree: int, step: float) -> Jury:
+    return Jury(*open_problem(record), degree=degree, step=step)
+
+
+@lru_cache(maxsize=2)
 def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions) -> Refiner:
     problem, robot = open_problem(record)
     return load_refiner(problem, robot, spec=spec, options=options)
 
 
 def load_refiner(
-    problem: "Problem", robot: "Robot", *, spec: TrajectorySpec | None = None, options: RefineOptions = DEFAULT
+    problem: "Problem",
+    robot: "Robot",
+    *,
+    spec: TrajectorySpec | None = None,
+    options: RefineOptions = DEFAULT,
+    passes: Passes | None = None,
 ) -> Refiner:
     """Build the refiner of a problem with the fastest kernels that this machine can run.
 
@@ -74,6 +85,7 @@ def load_refiner(
         robot: Its robot.
         spec: Degree and numbers of control points; the problem's by default.
         options: How to refine.
+        passes: Grids and tightening; the usual ones by default.
     """
     from cnpgen.verify.world import World
 
@@ -88,5 +100,6 @@ def load_refiner(
         spec=spec,
         criterion=choose_criterion(problem, options.objective, options.weight),
         settings=settings,
+        passes=passes,
         solver=options.solver,
     )

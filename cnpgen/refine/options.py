@@ -20,7 +20,7 @@ class RefineOptions:
         weight: Weight of what is minimised beside the time; by default the problem's, or 1 for effort and jerk.
         solver: "own": sequential quadratic programming with DAQP; "ipopt" and "sqpmethod" are CasADi's.
         max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down.
-        tolerance: Relative change of the objective below which a feasible iterate is optimal.
+        tolerance: Relative change of the objective below which it has settled: what follows only makes it feasible.
         step: The verdict looks at moments no further apart than this [s].
 
     Raises:

@@ -111,9 +111,9 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
     return Refined(**{**vars(best.refined), "iterations": search.iterations})
 
 
-def _as_given(refiner: Refiner, task: Task, given: Attempt | None) -> list[tuple[Array, Array]]:
+def _as_given(refiner: Refiner, task: Task, given: Array | None) -> list[tuple[Array, Array]]:
     """Return the plan as it was given, where it can be evaluated: with exact ends, and as it is."""
-    plans = [] if given is None else [refiner.check.transcription(task).unpack(given.x)]
+    plans = [] if given is None else [refiner.check.transcription(task).unpack(given)]
     if task.path is not None and task.rate is not None and np.isfinite(task.path).all():
         forward = Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]
         plans += [(task.path, task.rate)] if forward else []

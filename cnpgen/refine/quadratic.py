@@ -17,7 +17,6 @@ USED = 1e-3  # its slope where nothing is violated
 MULTIPLIER = 1e-9  # smaller ones belong to residuals that are not active
 FEASIBLE = 1e-6  # of DAQP
 CHANGES = 3000  # largest number of working-set changes
-ACTIVE = 3e-3  # residuals this close to a bound are held at every grid point
 LOWER, UPPER = 3, 1  # how DAQP is told what is active
 
 
@@ -118,10 +117,7 @@ class Model:
 
 
 def choose(g: Array, bounds: Bounds, *, thin: int, near: float, leaps: Array) -> Mask:
-    """Pick the residuals that matter, shape (K, m).
-
-    They are close to a bound, and at a local maximum, active, or on the thinned grid; or they are sharp and may leap
-    over it.
+    """Pick the residuals that matter, shape (K, m): at a crest near a bound, or sharp, so that they may leap over it.
 
     Args:
         g: Residuals, shape (K, m).
@@ -131,6 +127,17 @@ def choose(g: Array, bounds: Bounds, *, thin: int, near: float, leaps: Array) ->
         leaps: How far sharp residuals may leap, shape (K, m).
     """
     excess = bounds.excess(g)
+    picked: Mask = (crests(excess, thin=thin) & (excess > -near)) | (bounds.sharp & (excess > -leaps))
+    return picked
+
+
+def crests(excess: Array, *, thin: int) -> Mask:
+    """Find local maxima along the motion, their neighbours, and the thinned grid, shape (K, m).
+
+    Args:
+        excess: How far residuals are outside, shape (K, m).
+        thin: Every how many grid points the thinned grid has one.
+    """
     peak = np.zeros(excess.shape, bool, order="F")
     peak[1:-1] = (excess[1:-1] >= excess[:-2]) & (excess[1:-1] >= excess[2:])
     peak[0], peak[-1] = excess[0] >= excess[1], excess[-1] >= excess[-2]
@@ -138,6 +145,4 @@ def choose(g: Array, bounds: Bounds, *, thin: int, near: float, leaps: Array) ->
     wide[1:] |= peak[:-1]
     wide[:-1] |= peak[1:]
     wide[::thin] = True
-    wide |= excess > -ACTIVE
-    picked: Mask = (wide & (excess > -near)) | (bounds.sharp & (excess > -leaps))
-    return picked
+    return wide

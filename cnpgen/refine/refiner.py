@@ -12,7 +12,7 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.recipes import Problem, TrajectorySpec
 from cnpgen.refine import starts
 from cnpgen.refine.alternatives import minimise_with
-from cnpgen.refine.bounds import BoundsTemplate, Tightening
+from cnpgen.refine.bounds import Bounds, BoundsTemplate, Tightening
 from cnpgen.refine.criterion import Criterion, criterion_residuals
 from cnpgen.refine.fine import FineCheck
 from cnpgen.refine.grid import make_grid
@@ -20,7 +20,6 @@ from cnpgen.refine.sqp import DEFAULT, Result, Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Attempt, Outcome, Task
 from cnpgen.refine.transcription import Stage, Transcription
-from cnpgen.trajectory.motion import Motion
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -87,6 +86,7 @@ class Refiner:
         spec: Degree and numbers of control points; the problem's by default.
         criterion: What is minimised beside the time, or None.
         settings: How to iterate.
+        passes: Grids and tightening; ``default_passes`` by default.
         solver: "own", "ipopt" or "sqpmethod".
     """
 
@@ -100,6 +100,7 @@ class Refiner:
         spec: TrajectorySpec | None = None,
         criterion: Criterion | None = None,
         settings: Settings = DEFAULT,
+        passes: Passes | None = None,
         solver: str = "own",
     ) -> None:
         self.problem, self.robot, self.settings = problem, robot, settings
@@ -107,7 +108,7 @@ class Refiner:
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
         self.stage = Stage(self.spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals)
-        self.passes = default_passes(problem, settings)
+        self.passes = default_passes(problem, settings) if passes is None else passes
         self.check = FineCheck(problem, world, self.stage)
         self._grids = {points: make_grid(self.spec, points) for points in {each.points for each in self._every}}
         self._bounds = {
@@ -122,8 +123,8 @@ class Refiner:
     def _middle(self) -> Array:
         return (self.robot.position_lower + self.robot.position_upper) / 2
 
-    def given(self, task: Task) -> Attempt | None:
-        """Return the plan of the task with exact boundary control points, or None where there is no usable one.
+    def given(self, task: Task) -> Array | None:
+        """Return the variables of the task's plan, or None where there is no usable one.
 
         One that takes longer than a minute is none: from there the quadratic programmes hardly move.
 
@@ -133,28 +134,22 @@ class Refiner:
             return None
         if not np.isfinite(task.rate).all() or not np.any(task.rate > 0):
             return None
-        if not Motion(task.path[None], task.rate[None], self.spec.degree).duration()[0] < SLOWEST:
-            return None
-        x = self.check.transcription(task).pack(task.path, np.maximum(task.rate, LOWEST_RATE * task.rate.max()))
-        cost, excess = self.check.measure(task, x)
-        return Attempt(x, excess.worst, cost, Outcome.KEPT)
+        motion, rate = self.check.transcription(task), np.maximum(task.rate, LOWEST_RATE * task.rate.max())
+        return motion.pack(task.path, rate) if motion.duration(rate) < SLOWEST else None
 
-    def attempts(self, task: Task, given: Attempt | None) -> Iterator[Attempt]:
+    def attempts(self, task: Task, given: Array | None) -> Iterator[Attempt]:
         """Yield plans, dearer ones later; whoever asks for the next one found something wrong with the last one.
 
         Args:
             task: What to plan; its boundary conditions are numbers.
             given: What ``given`` says of it.
         """
-        slowing, repaired = self.settings.max_iterations == 0, given
-        if given is not None and given.excess > 1 and task.at_rest:
-            repaired = self._slowed(task, given, at_any_cost=slowing)
-        if slowing:
-            yield repaired if repaired is not None else self._measured(task, self._straight(task))
+        if self.settings.max_iterations == 0:
+            x, outcome = (self.straight(task), Outcome.UNSOLVED) if given is None else (given, Outcome.KEPT)
+            yield self._repaired(task, x, outcome, at_any_cost=given is not None)
             return
-        usable = repaired is not None and repaired.excess < np.inf
-        x = repaired.x if repaired is not None and usable else self._straight(task)
-        best = self._attempt(task, self.passes.first, x, Outcome.SOLVED, warm=usable)
+        repaired = self._repaired(task, given, Outcome.KEPT) if given is not None and task.at_rest else None
+        best = self._first(task, given if repaired is None else repaired.x)
         yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
         yield polished
@@ -176,7 +171,7 @@ class Refiner:
         settings = replace(which.settings, radius=min(which.settings.radius, WARM_RADIUS)) if warm else which.settings
         motion = self.transcription(task, which)
         ends = motion.end_residuals()
-        bounds = self._bounds[which].of(task.start_xyz, ends=ends)
+        bounds = self.bounds(task, which, ends)
         if not bounds.beyond(ends) < LOST:
             settings = replace(settings, max_iterations=0)
         return self._minimise(motion, bounds, x, settings)
@@ -185,12 +180,27 @@ class Refiner:
         """Return the motion on the grid of a pass."""
         return Transcription(self.stage, self._grids[which.points], boundary=task.boundary, tops=task.tops)
 
-    def _straight(self, task: Task) -> Array:
+    def bounds(self, task: Task, which: Pass, ends: Array) -> Bounds:
+        """Return the bounds of a pass for a motion whose boundary states have residuals ``ends``, shape (2, m)."""
+        return self._bounds[which].of(task.start_xyz, ends=ends)
+
+    def straight(self, task: Task) -> Array:
+        """Return the variables of the straight line at a constant rate."""
         return _variables(starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
 
-    def _measured(self, task: Task, x: Array) -> Attempt:
+    def _repaired(self, task: Task, x: Array, outcome: Outcome, *, at_any_cost: bool = False) -> Attempt:
+        """Slow a motion from rest to rest down where that makes it better."""
         cost, excess = self.check.measure(task, x)
-        return Attempt(x, excess.worst, cost, Outcome.UNSOLVED)
+        attempt = Attempt(x, excess.worst, cost, outcome)
+        return self._slowed(task, attempt, at_any_cost=at_any_cost) if attempt.excess > 1 and task.at_rest else attempt
+
+    def _first(self, task: Task, x: Array | None) -> Attempt:
+        """Run the first pass from variables, or from a straight line where there are none that can be evaluated."""
+        if x is not None:
+            attempt = self._attempt(task, self.passes.first, x, Outcome.SOLVED, warm=True)
+            if attempt.excess < np.inf:
+                return attempt
+        return self._attempt(task, self.passes.first, self.straight(task), Outcome.SOLVED)
 
     def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, *, warm: bool = False) -> Attempt:
         result = self.minimise(task, which, x, warm=warm)

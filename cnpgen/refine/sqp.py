@@ -7,6 +7,10 @@ where the objective is flat.
 
 A merit function alone refuses good steps along a curved manifold, since they leave it by their square (Maratos). So a
 step is also taken for the objective's sake if it violates no more than the width of a funnel, which narrows each time.
+
+Along flat directions of the objective steps never become short, and every one of them breaks residuals by its square.
+Once a step has changed the objective by less than the tolerance, a heavy proximal term keeps the next ones to what
+makes the iterate feasible: it lands.
 """
 
 from dataclasses import dataclass
@@ -15,18 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.bounds import Bounds
-from cnpgen.refine.quadratic import Mask, Model, Step, choose
+from cnpgen.refine.quadratic import Mask, Model, Step, choose, crests
 from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
 LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
-WIDE = 0.15  # trust radius of a start that is not near a solution
 LEAP = 1.5  # the next step may be longer than the last one by this factor
 NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the first, residuals this near are held
+LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
-FUNNEL, NARROWER, WORTH = 0.3, 0.7, 0.1  # first width, what is left of it each time, share of the promised gain
+FUNNEL, NARROWER, WORTH = 2.0, 0.7, 0.1  # first width, what is left of it each time, share of the promised gain
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
@@ -39,7 +43,7 @@ class Settings:
         radius: First trust radius, infinity norm [rad and log].
         proximal: Weight of the proximal term.
         penalty: Weight of the worst violation in the merit function.
-        cost_tolerance: Relative change of the objective below which a feasible iterate is optimal.
+        cost_tolerance: Relative change of the objective below which it has settled.
         violation_tolerance: Worst scaled violation of a feasible iterate.
         thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
     """
@@ -48,7 +52,7 @@ class Settings:
     radius: float = 0.3
     proximal: float = 0.02
     penalty: float = 2.0
-    cost_tolerance: float = 2e-4
+    cost_tolerance: float = 1e-3
     violation_tolerance: float = 6e-4
     thin: int = 6
 
@@ -110,8 +114,9 @@ class _Descent:
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
         self._radius, self._funnel = settings.radius, FUNNEL
-        self._length = 1.0 if settings.radius > WIDE else 0.2  # of the last step, in the same norm
+        self._length = LARGEST  # of the last step, in the same norm
         self._multipliers: Array | None = None
+        self._settled = False
         self._missed = np.zeros(at.g.shape, bool)  # residuals that a rejected step broke unseen
 
     def advance(self) -> None:
@@ -119,7 +124,8 @@ class _Descent:
         at = self._at = self._at or self._motion.evaluate(self.x)
         held = self._held(at)
         settings = self._settings
-        model = Model(self._motion, at, self._bounds, self.violation, settings.proximal, settings.penalty)
+        proximal = LANDING if self._settled else settings.proximal
+        model = Model(self._motion, at, self._bounds, self.violation, proximal, settings.penalty)
         step = self._propose(model, held)
         if step is None:
             self._radius *= 0.25
@@ -131,13 +137,15 @@ class _Descent:
     def _is_stuck(self) -> bool:
         """Whether it was never feasible, and the least violation hardly falls any more."""
         before, recent = self._violations[:-PATIENCE], self._violations[-PATIENCE:]
-        return bool(before) and min(recent) > max(PROGRESS * min(before), self._settings.violation_tolerance)
+        least = min(before, default=0.0)
+        return least > self._settings.violation_tolerance and min(recent) > PROGRESS * least
 
     def _held(self, at: Evaluation) -> Mask:
         """Choose the residuals of the next quadratic programme."""
         near = next(near for length, near in NEAR if self._length > length)
         leaps = self._motion.leaps(at, LEAP * self._length)
-        return choose(at.g, self._bounds, thin=self._settings.thin, near=near, leaps=leaps) | self._missed
+        held = choose(at.g, self._bounds, thin=self._settings.thin, near=near, leaps=leaps) | self._missed
+        return held if self._multipliers is None else held | (self._multipliers != 0)
 
     def _propose(self, model: Model, held: Mask) -> Step | None:
         """Solve the quadratic programme, again in other ways where that helps little."""
@@ -158,8 +166,9 @@ class _Descent:
         gain = -model.cost(step.dx)
         predicted = gain + settings.penalty * self.violation * (1 - step.left)
         reduction = self.cost - cost + settings.penalty * (self.violation - violation)
-        size = float(np.abs(step.dx / self._scale).max())
         cheaper = violation <= self._funnel and self.cost - cost > WORTH * gain > 0
+        size = float(np.abs(step.dx / self._scale).max())
+        self._multipliers = step.multipliers
         if np.isfinite(reduction) and (cheaper or reduction > ENOUGH * predicted):
             if reduction <= ENOUGH * predicted:
                 self._funnel *= NARROWER
@@ -167,13 +176,16 @@ class _Descent:
                 self._radius = min(2.5 * self._radius, LARGEST) if size > 0.8 * self._radius else self._radius
             elif reduction < POOR * predicted:
                 self._radius *= 0.5
-            feasible = violation < settings.violation_tolerance
-            self.ended = feasible and abs(self.cost - cost) < settings.cost_tolerance * cost
-            self._at, self.x, self.cost, self.violation = None, x, cost, violation
-            self._length, self._multipliers = size, step.multipliers
+            self._settled = abs(self.cost - cost) < settings.cost_tolerance * cost
+            self.ended = self._settled and violation < settings.violation_tolerance
+            self._at, self.x, self.cost, self.violation, self._length = None, x, cost, violation, size
             self._missed[:] = False
         else:
-            missed = (self._bounds.excess(g) > settings.violation_tolerance) & ~held
-            self._missed |= missed
-            if not missed.any():
-                self._radius = 0.35 * min(self._radius, size)
+            self._learn(self._bounds.excess(g), held, size)
+
+    def _learn(self, excess: Array, held: Mask, size: float) -> None:
+        """Hold what a refused step broke unseen; make the next one shorter if that was not the worst of it."""
+        broken = crests(excess, thin=self._settings.thin) & (excess > self._settings.violation_tolerance)
+        self._missed |= broken & ~held
+        if not excess[~held].max(initial=0.0) >= excess.max():
+            self._radius = 0.35 * min(self._radius, size)

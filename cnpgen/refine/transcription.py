@@ -6,7 +6,9 @@ A). Residuals are the problem's constraints, each divided by a natural size (``c
 violation of 1e-3 means about the same everywhere.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from cnpgen.trajectory.slopes import boundary_slopes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+T = TypeVar("T")
 SMOOTH_RATE = 1e-4  # weight of the squared second differences of log r: fixes the gauge between p and r
 
 
@@ -86,6 +89,8 @@ class Transcription:
         self._tops = np.repeat(tops[:, None], len(grid.s), axis=1)
         second = np.diff(np.eye(spec.rate_control_points), 2, axis=0)
         self._smooth = 2 * SMOOTH_RATE * second.T @ second
+        self._at = _of_last(self._states)  # steps that are taken are evaluated again, with derivatives
+        self._residuals = _of_last(self._criterion_residuals)
 
     def unpack(self, x: Array) -> tuple[Array, Array]:
         """Return path control points (C, n) and rate control points (R,) of the variables."""
@@ -126,8 +131,11 @@ class Transcription:
             path: Path control points [rad], shape (C, n).
             rate: Rate control points [1/s], shape (R,).
         """
-        duration = float(self.grid.weights @ (1.0 / (self.grid.gauss @ rate)))
-        return duration + (0.0 if self.stage.criterion is None else self._criterion(path, rate))
+        return self.duration(rate) + (0.0 if self.stage.criterion is None else self._criterion(path, rate))
+
+    def duration(self, rate: Array) -> float:
+        """Return the motion time [s] of rate control points [1/s], shape (R,)."""
+        return float(self.grid.weights @ (1.0 / (self.grid.gauss @ rate)))
 
     def evaluate(self, x: Array) -> Evaluation:
         """Evaluate objective and residuals with their derivatives."""
@@ -165,12 +173,12 @@ class Transcription:
         reach: Array = np.abs(at.jacobian[3 * self.n + 1]).T * change[:, None]
         return reach
 
-    def _at(self, x: Array) -> tuple[Array, Array, Array]:
+    def _states(self, x: Array) -> tuple[Array, Array, Array]:
         """Return w = (p, p', p'', r, r') on the grid, shape (3 n + 2, K), and the control points."""
         path, rate = self.unpack(x)
         return self.grid.bases.states(path, rate), path, rate
 
-    def _residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
+    def _criterion_residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
         """Return the criterion's residuals (m, Q) at its nodes, their Jacobian (4 n + 3, m, Q) and weights (Q,)."""
         assert self.stage.criterion is not None
         assert self.stage.residuals is not None
@@ -211,3 +219,16 @@ class Transcription:
         for each in boundary_slopes(self.boundary, rate[None], self.spec):
             out[:, self.split + each.variable] += control[:, each.point] @ (each.slope[0] * rate[each.variable])
         return out
+
+
+def _of_last(function: Callable[..., T]) -> Callable[..., T]:
+    """Keep what a function returned for the arrays that it was last given."""
+    last: list[Any] = [(), None]
+
+    def recall(*arrays: Array) -> T:
+        if len(last[0]) != len(arrays) or any(a is not b for a, b in zip(last[0], arrays, strict=True)):
+            last[:] = arrays, function(*arrays)
+        result: T = last[1]
+        return result
+
+    return recall
