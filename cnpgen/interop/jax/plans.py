@@ -1,0 +1,190 @@
+"""Plans with gradients: control points from a network's outputs, and their loss; both may be jitted."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.arguments import number
+from cnpgen.errors import UsageError
+from cnpgen.interop.host import evaluate
+from cnpgen.losses.plan_batch import real_array
+from cnpgen.losses.quadrature import check_quadrature
+from cnpgen.network.tasks import Tasks
+from cnpgen.trajectory.boundary import Boundary
+
+if TYPE_CHECKING:
+    from cnpgen.interop.omega import Omega
+    from cnpgen.losses.plan_loss import PlanLoss
+
+for _kind in (Tasks, Boundary):
+    jax.tree_util.register_dataclass(_kind, [field.name for field in fields(_kind)], [])  # jit takes them as arguments
+
+
+def control_points(omega: "Omega", tasks: Tasks, phi: jax.Array, log_rate: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Turn a network's outputs into control points that meet the boundary conditions, differentiably (once).
+
+    Computed on the host in float64. ``omega.plans`` makes plans of the same outputs, with all digits.
+
+    Args:
+        omega: The problem's block.
+        tasks: N tasks, what ``omega.tasks`` returned; constants, but under ``jit`` they may be an argument.
+        phi: The network's say on the path, shape (N, ``omega.path_outputs``).
+        log_rate: Its say on the rate, shape (N, ``omega.rate_outputs``).
+
+    Returns:
+        Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R), in the type of phi, at least float32.
+
+    Raises:
+        UsageError: A shape is wrong.
+    """
+    dtype = jnp.promote_types(phi.dtype, np.float32)
+    phi, log_rate = _real("phi", phi, dtype), _real("log_rate", log_rate, dtype)
+    omega.check_shapes(tasks, phi.shape, log_rate.shape)
+    path, rate = _control_points(omega, jax.tree.map(jnp.asarray, tasks), phi, log_rate)
+    return path, rate
+
+
+def plan_loss(
+    loss: "PlanLoss",
+    path: jax.Array,
+    rate: jax.Array,
+    *,
+    weights: jax.Array | ArrayLike,
+    tops: jax.Array | ArrayLike | None = None,
+    start_tip: jax.Array | ArrayLike | None = None,
+    shift: jax.Array | float = 0.0,
+) -> tuple[jax.Array, jax.Array]:
+    """Evaluate a loss of N plans, differentiably (once) in control points and weights, on the CPU.
+
+    A plan whose loss is not finite has a gradient of 0, so that it touches no other: neither through
+    ``jnp.where(jnp.isfinite(total), total, 0)`` nor through ``total.mean()``, which is nan itself.
+
+    Args:
+        loss: The loss; its ``dtype`` is the precision of values and gradients.
+        path: Path control points [rad], shape (N, C, n), of any type.
+        rate: Rate control points [1/s], shape (N, R), positive.
+        weights: Weight of every constraint term (e^alpha), shape (m,).
+        tops: Heights of the obstacles' upper faces [m], shape (N, obstacles). Like those that follow, a constant, but
+            under ``jit`` it may be an argument.
+        start_tip: Positions of the tip at the start [m], shape (N, 3).
+        shift: Of the quadrature nodes, in [0, 1); where its value is not known yet, whole numbers in it do not count.
+
+    Returns:
+        The totals, shape (N,), and the integrals without weights, shape (N, 1 + m), which have no gradient.
+
+    Raises:
+        UsageError: A shape is wrong, a value that is known when the function is traced is, or the loss is in float64
+            and JAX is not. Weights that are known only later raise it within JAX's own error.
+    """
+    if loss.dtype == "float64" and not jax.config.jax_enable_x64:
+        raise UsageError('JAX would shorten a loss in float64: jax.config.update("jax_enable_x64", True) keeps it')
+    if not isinstance(shift, jax.core.Tracer):
+        check_quadrature(loss.rule, loss.nodes, number("shift", shift))
+    if not isinstance(weights, jax.core.Tracer):
+        loss.checked_weights(weights)
+    given = {"path": path, "rate": rate, "weights": weights, "tops": tops, "start_tip": start_tip}
+    arrays = {name: _real(name, values, loss.dtype) for name, values in given.items() if values is not None}
+    loss.check_shapes(**{name: array.shape for name, array in arrays.items()})
+    variables = [arrays.pop(name) for name in ("path", "rate", "weights")]
+    total, terms = _plan_loss(loss, *variables, arrays | {"shift": jnp.asarray(shift, loss.dtype)})
+    return total, jax.lax.stop_gradient(terms)
+
+
+def _evaluate(loss: "PlanLoss", *, gradient: bool, arguments: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+    """Call the loss on the host; return totals and terms, and the slopes if they are wanted."""
+    path, rate, weights, _ = arguments
+    n, m = len(path), len(weights)
+    shapes = [(n,), (n, 1 + m), *([path.shape, rate.shape, (n, m)] if gradient else [])]
+
+    def call(*arguments: Any) -> tuple[Any, ...]:
+        *variables, given = jax.tree.map(np.asarray, arguments)
+        # what is just below 1 is 1 in float32; a step of whole nodes is none
+        given["shift"] = given["shift"].item() % 1
+        return evaluate(loss, *variables, gradient=gradient, **given)[: len(shapes)]
+
+    return _on_host(call, [jax.ShapeDtypeStruct(shape, loss.dtype) for shape in shapes], *arguments)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _plan_loss(loss: "PlanLoss", *arguments: Any) -> tuple[jax.Array, ...]:
+    return _evaluate(loss, gradient=False, arguments=arguments)
+
+
+def _loss_forward(loss: "PlanLoss", *arguments: Any) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+    total, terms, *slopes = _evaluate(loss, gradient=True, arguments=arguments)
+    return (total, terms), (total, slopes, arguments[-1])
+
+
+def _loss_backward(_loss: "PlanLoss", residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]) -> tuple[Any, ...]:
+    total, (by_path, by_rate, by_weights), given = residual
+    by_total = jnp.where(jnp.isfinite(total), by_results[0], 0)
+    return (
+        by_path * by_total[:, None, None],
+        by_rate * by_total[:, None],
+        by_total @ by_weights,
+        jax.tree.map(jnp.zeros_like, given),
+    )
+
+
+_plan_loss.defvjp(_loss_forward, _loss_backward)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _control_points(omega: "Omega", tasks: Tasks, phi: jax.Array, log_rate: jax.Array) -> tuple[jax.Array, ...]:
+    spec = omega.problem.trajectory
+    shapes = (len(phi), spec.path_control_points, len(omega.problem.robot.joints)), (len(phi), spec.rate_control_points)
+
+    def call(*arguments: Any) -> tuple[Any, ...]:
+        points = omega(*jax.tree.map(_wide, arguments))
+        return points.path.astype(phi.dtype), points.rate.astype(phi.dtype)
+
+    return _on_host(call, [jax.ShapeDtypeStruct(shape, phi.dtype) for shape in shapes], tasks, phi, log_rate)
+
+
+def _points_forward(omega: "Omega", *arguments: Any) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+    return _control_points(omega, *arguments), arguments
+
+
+def _points_backward(
+    omega: "Omega", residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]
+) -> tuple[Any, jax.Array, jax.Array]:
+    tasks, *outputs = residual
+
+    def call(*arguments: Any) -> tuple[Any, ...]:
+        *given, by_path, by_rate = jax.tree.map(_wide, arguments)
+        found = omega.pull_back(*given, path_gradient=by_path, rate_gradient=by_rate)
+        return tuple(each.astype(outputs[0].dtype) for each in found)
+
+    results = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in outputs]
+    by_phi, by_log_rate = _on_host(call, results, *residual, *by_results)
+    return jax.tree.map(jnp.zeros_like, tasks), by_phi, by_log_rate
+
+
+_control_points.defvjp(_points_forward, _points_backward)
+
+
+def _on_host(call: Callable[..., Any], results: list[Any], *arguments: Any) -> tuple[jax.Array, ...]:
+    found: tuple[jax.Array, ...] = jax.pure_callback(call, tuple(results), *arguments, vmap_method="sequential")
+    return found
+
+
+def _real(name: str, values: Any, dtype: Any) -> jax.Array:
+    """Return an array of JAX of a float type.
+
+    Raises:
+        UsageError: These are no real numbers.
+    """
+    array = values if isinstance(values, jax.Array) else jnp.asarray(real_array(name, values, "float64"))
+    if jnp.iscomplexobj(array):
+        raise UsageError(f"{name} must be real numbers, got {array.dtype}")
+    return array.astype(dtype)
+
+
+def _wide(values: Any) -> NDArray[np.float64]:
+    return np.asarray(values, np.float64)
