@@ -107,7 +107,8 @@ class Reader:
 
         from cnpgen.interop.torch import BatchDataset
 
-        return self._packed(DataLoader(BatchDataset(self.kept), batch_size=None, num_workers=workers))
+        for batch in DataLoader(BatchDataset(self.kept), batch_size=None, num_workers=workers):
+            yield batch.table.numpy()
 
     def torch_rows(self, workers: int) -> Tables:
         """Read rows batch by batch from memory maps, in the order of torch's own sampler."""
@@ -127,14 +128,11 @@ class Reader:
         rows = PerRow(self.dataset, self.names)
         return self._packed(DataLoader(rows, self.batch_size, shuffle=True, num_workers=workers))
 
-    def _packed(self, loader: Any) -> Tables:
-        """Lay tensors side by side, where they are not already."""
+    @staticmethod
+    def _packed(loader: Any) -> Tables:
+        """Lay tensors side by side."""
         for batch in loader:
-            first = next(iter(batch.values()))
-            if first._base is not None and first._base.ndim == 2 and first._base.shape[1] == self.table.shape[1]:
-                yield first._base.numpy()
-            else:
-                yield np.concatenate([values.numpy().reshape(len(values), -1) for values in batch.values()], axis=1)
+            yield np.concatenate([values.numpy().reshape(len(values), -1) for values in batch.values()], axis=1)
 
 
 class PerRow:
