@@ -156,6 +156,12 @@ def test_a_dataset_without_training_rows_cannot_be_normalised_by_itself(dataset:
     assert np.allclose(np.concatenate([batch["start_q"] for batch in borrowed]), expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("option", ["allow_incomplete", "verify"])
+def test_options_are_yes_or_no(tmp_path: Path, option: str) -> None:
+    with pytest.raises(UsageError, match=f"{option} must be True or False, got 'no'"):
+        load_dataset(make(tmp_path), **{option: "no"})  # type: ignore[arg-type]
+
+
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"plan\.json is missing"):
         load_dataset(tmp_path)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from cnpgen.arguments import flag
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.shards import AGAIN, Shard, ShardReader
@@ -29,12 +30,12 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
         verify: Compare the sha256 of every shard, once, when it is first read.
 
     Raises:
-        UsageError: There is no such folder.
+        UsageError: There is no such folder, or an option is neither True nor False.
         DatasetError: It holds no dataset, it is unfinished, or a part of it is missing or damaged.
         MachineError: The system would not let us read something.
     """
-    folder = Path(folder)
-    stored = open_dataset(folder, allow_partial=allow_incomplete)
+    folder, verify = Path(folder), flag("verify", verify)
+    stored = open_dataset(folder, allow_partial=flag("allow_incomplete", allow_incomplete))
     if stored.manifest is None:
         summary = summarise(folder, stored.plan, allow_partial=True)
         shards, statistics = _recorded(folder, summary), summary.statistics
