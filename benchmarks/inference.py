@@ -1,7 +1,8 @@
 """Planning with a trained model: one plan at a time and 1,024 together, with everything around the network.
 
 The clock is the process's CPU time, one BLAS thread; medians over the repetitions, which measure all cases in turn.
-``slow-down`` is what motions from rest to rest are given afterwards.
+What ``Planner`` does by default is held to the targets; of motions from rest to rest that is with the slow-down
+afterwards, and the network alone is shown beside it.
 
     python benchmarks/inference.py
     python benchmarks/inference.py --model model.h5 --dataset folder
@@ -22,15 +23,16 @@ from cnpgen.planner.requests import read_rows
 from cnpgen.threads import one_thread
 
 BATCH = 1024
+DEFAULT = "default"
 TARGETS = {1: 0.3, BATCH: 0.03}  # ms per plan
 
 
 def measure(model: str, folder: Path, repeat: int) -> list[dict[str, Any]]:
     """Milliseconds per plan, batch by batch, with and without the slow-down."""
-    planners = {"network": Planner(model, slow_down=False)}
-    if planners["network"].model.rests:
-        planners["network, slow-down"] = Planner(model)
-    asked = read_rows(folder, planners["network"].model, n=BATCH, split="train").boundary
+    planners = {DEFAULT: Planner(model)}
+    if planners[DEFAULT].model.rests:
+        planners["without slow-down"] = Planner(model, slow_down=False)
+    asked = read_rows(folder, planners[DEFAULT].model, n=BATCH, split="train").boundary
     found = []
     with one_thread():
         for size in (1, BATCH):
@@ -63,7 +65,7 @@ def main() -> None:
             found += measure(model, folder, chosen.repeat)
     rows = []
     for each in found:
-        target = TARGETS[each["batch"]] if each["what"] == "network" else None
+        target = TARGETS[each["batch"]] if each["what"] == DEFAULT else None
         cells = (Path(each["model"]).stem, each["what"], str(each["batch"]), f"{each['ms_per_plan']:.4f}")
         ratio = f"{each['ms_per_plan'] / target:.2f}" if target else ""
         rows.append((*cells, *verdict(each["ms_per_plan"], target, at_most=True), ratio))

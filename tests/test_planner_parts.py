@@ -124,6 +124,29 @@ def test_slowed_motions_meet_velocity_acceleration_and_torque_and_slightly_faste
     assert (np.max([faster[name] for name in LIMITS], axis=0)[needed] > 1).all()
 
 
+def test_a_first_look_finds_the_motions_that_need_to_be_slower_and_no_others(fast):
+    """The first look asks one number of every phase; what it lets pass must be within every bound, by the residuals."""
+    given, _, _, motion, tops = fast
+    slowing = make_slowing(given.problem, given.robot, given.kernels)
+    needed = slowing._needed(motion, tops)
+    for pace in (1.0, np.median(needed), 0.999 * needed.max(), 1.01 * needed.max()):
+        slower = motion.slower(np.full(12, pace))
+        (values,) = slowing.residuals(*slowing._states(slower, tops, 1.0))
+        out = np.maximum(values - slowing.upper[:, None], slowing.lower[:, None] - values).max(axis=0)
+        (excess,) = slowing.excess(slowing._column(slower, tops))
+        np.testing.assert_allclose(excess[0], out, atol=1e-9)
+        np.testing.assert_array_equal(slowing.factor(slower, tops) > 1, out.reshape(12, -1).max(axis=1) > 0)
+
+
+def test_a_motion_that_is_none_touches_no_other(fast):
+    given, _, _, motion, tops = fast
+    slowing = make_slowing(given.problem, given.robot, given.kernels)
+    broken = replace(motion, rate=np.where(np.arange(12)[:, None] == 3, np.nan, motion.rate))
+    np.testing.assert_array_equal(
+        np.delete(slowing.factor(broken, tops), 3), np.delete(slowing.factor(motion, tops), 3)
+    )
+
+
 def test_motions_within_their_limits_are_left_as_they_are(fast):
     given, _, _, motion, tops = fast
     slow = motion.slower(np.full(12, 10.0))

@@ -1,5 +1,6 @@
 """What a planner computes with kernels: tip positions, equalities of the manifold, what slowing down helps against."""
 
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,6 +56,29 @@ def speed_residuals(robot: "Robot", problem: Problem) -> Any:
     ]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
     return ca.Function("speed_residuals", [q_sx, dq_sx, ddq_sx, tops_sx], [g])
+
+
+def speed_excess(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(p, p', p'', r, r', tops, in one column) -> e``: by how much the worst of ``speed_residuals`` is out.
+
+    Negative if all are within their bounds. The column is one argument because a first look at one plan takes no longer
+    than handing over five.
+    """
+    import casadi as ca
+
+    n, names = robot.n, ("p", "p1", "p2", "rates", "tops")
+    widths = (n, n, n, 2, len(problem.obstacle))
+    columns, (p, p1, p2, (r, r1), tops) = zip(*map(symbols, names, widths), strict=True)
+    dq = [slope * r for slope in p1]
+    ddq = [(curve * r + slope * r1) * r for curve, slope in zip(p2, p1, strict=True)]
+    out: list[Any] = []
+    for condition in _conditions(robot, problem, (p, dq, ddq), tops):
+        if condition.needs:
+            for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True):
+                out += [float(low) - value] if np.isfinite(low) else []
+                out += [value - float(high)] if np.isfinite(high) else []
+    worst = reduce(ca.fmax, out) if out else ca.SX(-1)
+    return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
 
 
 def count_equalities(robot: "Robot", problem: Problem) -> int:

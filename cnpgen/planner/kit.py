@@ -100,7 +100,8 @@ class Kit:
         (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
         motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
         if self.slowing is not None:
-            motion = motion.slower(self.slowing.factor(motion, tops))
+            factor = self.slowing.factor(motion, tops)
+            motion = motion if factor.max(initial=1.0) <= 1 else motion.slower(factor)
         return Plans(
             problem=model.problem,
             boundary=boundary,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import speed_bounds, speed_residuals
+from cnpgen.planner.expressions import speed_bounds, speed_excess, speed_residuals
 from cnpgen.recipes import Problem
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import basis, chebyshev
@@ -34,6 +34,7 @@ class Slowing:
     """Finds how much slower motions of one problem must be; made by ``make_slowing``.
 
     Attributes:
+        excess: Kernel of ``expressions.speed_excess``.
         residuals: Kernel of ``expressions.speed_residuals``.
         lower: Lower bounds of its values, shape (m,).
         upper: Upper bounds, shape (m,).
@@ -41,6 +42,7 @@ class Slowing:
         rate: Basis of r and r', shape (2, K, R).
     """
 
+    excess: Kernel
     residuals: Kernel
     lower: Array
     upper: Array
@@ -59,17 +61,28 @@ class Slowing:
         Returns:
             Shape (N,).
         """
+        if len(motion) <= BLOCK:
+            return self._block(motion, tops)
         parts = [slice(first, first + BLOCK) for first in range(0, len(motion), BLOCK)]
-        return np.concatenate([np.empty(0), *(self._block(motion[part], tops[part]) for part in parts)])
+        return np.concatenate([self._block(motion[part], tops[part]) for part in parts])
 
     def _block(self, motion: Motion, tops: Array) -> Array:
-        (fast,) = self.residuals(*self._states(motion, tops, 1.0))
-        over = ((fast > self.upper[:, None]) | (fast < self.lower[:, None])).any(axis=0)
-        slower: NDArray[np.bool_] = np.asarray(over.reshape(len(motion), -1).any(axis=1))
-        factor = np.ones(len(motion))
-        if slower.any():  # most motions are slow enough, and one look tells
-            factor[slower] = self._needed(motion[slower], tops[slower])
+        (excess,) = self.excess(self._column(motion, tops))
+        factor, over = np.ones(len(motion)), excess > 0
+        if over.any():  # most motions are slow enough, and one look tells
+            fast = np.flatnonzero(over.reshape(len(motion), -1).any(axis=1))
+            factor[fast] = self._needed(motion[fast], tops[fast])
         return factor
+
+    def _column(self, motion: Motion, tops: Array) -> Array:
+        """Lay out p, p', p'', r, r' and obstacles at all phases of N motions, shape (3 n + 2 + obstacles, N K)."""
+        (_, phases, points), (count, _, n) = self.path.shape, motion.path.shape
+        out = np.empty((3 * n + 2 + tops.shape[1], count * phases))
+        path = motion.path.transpose(2, 0, 1).reshape(n * count, points)
+        np.matmul(path, self.path.swapaxes(1, 2), out=out[: 3 * n].reshape(3, n * count, phases))
+        np.matmul(motion.rate, self.rate.swapaxes(1, 2), out=out[3 * n : 3 * n + 2].reshape(2, count, phases))
+        out[3 * n + 2 :].reshape(-1, count, phases)[:] = tops.T[..., None]
+        return out
 
     def _needed(self, motion: Motion, tops: Array) -> Array:
         """Smallest factors of motions that exceed a limit somewhere."""
@@ -101,7 +114,8 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
     spec, s = problem.trajectory, chebyshev(PHASES)
     path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(3)])
     rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)])
-    return Slowing(kernels.load(speed_residuals), *speed_bounds(robot, problem), path, rate)
+    excess, residuals = kernels.load(speed_excess), kernels.load(speed_residuals)
+    return Slowing(excess, residuals, *speed_bounds(robot, problem), path, rate)
 
 
 def _lanes(tables: Array, points: Array) -> Array:
