@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import needs_compiler
 from example_plans_of_networks import at_ends, boundary, outputs
 
 from cnpgen.errors import UsageError
@@ -53,13 +54,15 @@ def test_gradients_of_outputs_are_those_of_central_differences(problem: str, lan
         np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2, rtol=1e-5, atol=1e-9)
 
 
-def test_a_row_that_overflows_touches_no_other(omegas: dict[str, Omega]) -> None:
-    omega = omegas["airhockey"]
+@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+def test_a_row_that_overflows_touches_no_other(backend: Any, cache_folder: Path) -> None:
+    omega = Omega("airhockey", backend=backend, cache_folder=cache_folder)
     tasks, (phi, log_rate) = omega.tasks(boundary("airhockey", 4)), outputs(omega, 4)
     ones = {"path_gradient": np.ones((4, 15, 6)), "rate_gradient": np.ones((4, 20))}
-    expected = omega.pull_back(tasks, phi, log_rate, **ones)
+    expected, points = omega.pull_back(tasks, phi, log_rate, **ones), omega(tasks, phi, log_rate)
     for value in (1000.0, -1000.0, np.nan):
         log_rate[2, 0] = value
+        np.testing.assert_array_equal(np.delete(omega(tasks, phi, log_rate).path - points.path, 2, 0), 0)
         found = omega.pull_back(tasks, phi, log_rate, **ones)
         for each, other in zip(found, expected, strict=True):
             assert (each[2] == 0).all()

@@ -18,6 +18,7 @@ from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import quadrature
 from cnpgen.recipes import Problem
 from cnpgen.schema import field
+from cnpgen.trajectory.motion import Motion
 
 PROBLEM_NAMES = ("airhockey", "heavy-object")
 LABEL_OF = {"airhockey": "hit", "heavy-object": "transport"}
@@ -155,6 +156,13 @@ def test_what_is_no_plan_costs_nan_and_touches_no_other(what, backend):
     for part in ("total", "terms", "path_gradient", "rate_gradient"):
         assert np.isnan(getattr(found, part)[2]).all()
         np.testing.assert_array_equal(getattr(found, part)[others], getattr(expected, part)[others])
+
+
+def test_a_control_point_of_the_rate_below_zero_makes_no_plan_even_where_the_motion_runs_forward():
+    of, given = loss("airhockey"), batch("hit", 2)
+    given.rate[1, 9] = -0.01
+    assert Motion(given.path, given.rate, 7).runs_forward().all()
+    assert np.isnan(given.evaluated(of).total).tolist() == [False, True]
 
 
 def test_control_points_metres_away_cost_much_and_stay_finite():

@@ -126,7 +126,10 @@ class Omega:
             UsageError: A shape is wrong, or something is no real number.
         """
         points, landing = self._before_landing(tasks, phi, log_rate), self._built[1]
-        return points if landing is None else replace(points, path=landing.land(points.path, self.tops(tasks)))
+        if landing is None:
+            return points
+        with np.errstate(all="ignore"):  # what overflows does so in its own row
+            return replace(points, path=landing.land(points.path, self.tops(tasks)))
 
     def pull_back(
         self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
@@ -187,5 +190,5 @@ class Omega:
 
 def _finite(*arrays: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether all numbers of a row are finite, shape (N,)."""
-    found = [np.isfinite(array).reshape(len(array), -1).all(axis=1) for array in arrays]
+    found = [np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays]
     return np.asarray(np.all(found, axis=0))

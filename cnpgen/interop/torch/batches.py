@@ -63,7 +63,8 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
     """Batches for a ``DataLoader(..., batch_size=None)``: every loop gives the rest of an epoch.
 
     With DataLoader workers the order is the same, and every loop begins the next epoch, also after one that was left
-    early. As each worker reads all shards, they cost more than they bring.
+    early; workers that live on are told of it by :meth:`set_epoch`, but not of a state that is loaded later. As each
+    worker reads all shards, they cost more than they bring.
 
     Args:
         batches: What ``dataset.batches(...)`` returned.
