@@ -1,1 +1,1 @@
-"""Bridges to other people's frameworks, one module each, to be imported only where that framework is installed."""
+"""Bridges to other people's frameworks, each imported only where that framework is; what they share needs none."""

@@ -73,7 +73,8 @@ class MetricSettings:
         return float(self.growth ** min(max((progress - begin) / (end - begin), 0.0), 1.0))
 
 
-PUBLISHED = MetricSettings(kind="learned", growth=1.0)  # the paper's rule with the authors' clip
+# The paper's rule with the authors' clip; the paper's budgets are those of PlanLoss(..., form="paper").
+PUBLISHED = MetricSettings(kind="learned", growth=1.0)
 # The same rule for short runs: steps per batch, budgets that shrink, bounds, a mean that a few plans cannot hold up.
 BOUNDED = MetricSettings(
     kind="learned",
