@@ -32,8 +32,8 @@ class Jury:
         self._judge, self._degree = Judge(problem, robot, step=step), degree
 
     def verdict(self, task: Task, path: Array, rate: Array) -> Verdict:
-        """Judge path control points (C, n) and rate control points (R,) as a plan of the task."""
-        return self._judge(*self._arguments(task, path, rate))[0]
+        """Judge path control points (C, n) and rate control points (R,) as a plan of the task, briefly."""
+        return self._judge(*self._arguments(task, path, rate), brief=True)[0]
 
     def refutes(self, task: Task, path: Array, rate: Array) -> bool:
         """Whether a few samples show already that such a plan is not valid."""

@@ -63,7 +63,7 @@ def default_passes(problem: Problem, settings: Settings) -> Passes:
     """Choose grids and tightening; obstacles need more room between the points of a grid."""
     crowded = bool(problem.obstacle)
     gentle, edge = (1e-3, LATE) if crowded else (1e-4, EARLY)
-    room = Tightening(limit=4e-3, gentle=gentle, clearance=1e-3, band=0.09, edge=edge)
+    room = Tightening(limit=4e-3, gentle=gentle, clearance=1e-3, band=0.088, edge=edge)
     strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE)
     short = replace(settings, radius=WARM_RADIUS, max_iterations=settings.max_iterations // 2)
     longer = replace(settings, max_iterations=settings.max_iterations * 3 // 2)
@@ -146,11 +146,16 @@ class Refiner:
         """
         if self.settings.max_iterations == 0:
             x, outcome = (self.straight(task), Outcome.UNSOLVED) if given is None else (given, Outcome.KEPT)
-            yield self._repaired(task, x, outcome, at_any_cost=given is not None)
+            yield self._measured(task, x, outcome, at_any_cost=given is not None)
             return
-        repaired = self._repaired(task, given, Outcome.KEPT) if given is not None and task.at_rest else None
-        best = self._first(task, given if repaired is None else repaired.x)
-        yield best
+        repaired = self._measured(task, given, Outcome.KEPT) if given is not None and task.at_rest else None
+        first = self._first(task, given if repaired is None else repaired.x)
+        if first.violation <= self.settings.violation_tolerance and not task.at_rest:
+            yield Attempt(first.x, 0.0, first.cost, Outcome.SOLVED, first.iterations)  # most are; no need to measure
+            best = self._measured(task, first.x, Outcome.SOLVED)
+        else:
+            best = self._measured(task, first.x, Outcome.SOLVED, first.iterations)
+            yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
         yield polished
         if repaired is not None and repaired.outcome is Outcome.SLOWED and repaired.excess <= 1:
@@ -188,25 +193,25 @@ class Refiner:
         """Return the variables of the straight line at a constant rate."""
         return _variables(starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
 
-    def _repaired(self, task: Task, x: Array, outcome: Outcome, *, at_any_cost: bool = False) -> Attempt:
-        """Slow a motion from rest to rest down where that makes it better."""
-        cost, excess = self.check.measure(task, x)
-        attempt = Attempt(x, excess.worst, cost, outcome)
-        return self._slowed(task, attempt, at_any_cost=at_any_cost) if attempt.excess > 1 and task.at_rest else attempt
-
-    def _first(self, task: Task, x: Array | None) -> Attempt:
+    def _first(self, task: Task, x: Array | None) -> Result:
         """Run the first pass from variables, or from a straight line where there are none that can be evaluated."""
         if x is not None:
-            attempt = self._attempt(task, self.passes.first, x, Outcome.SOLVED, warm=True)
-            if attempt.excess < np.inf:
-                return attempt
-        return self._attempt(task, self.passes.first, self.straight(task), Outcome.SOLVED)
+            result = self.minimise(task, self.passes.first, x, warm=True)
+            if result.violation < np.inf:
+                return result
+        return self.minimise(task, self.passes.first, self.straight(task))
 
     def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, *, warm: bool = False) -> Attempt:
         result = self.minimise(task, which, x, warm=warm)
-        cost, excess = self.check.measure(task, result.x)
-        attempt = Attempt(result.x, excess.worst, cost, outcome, result.iterations)
-        return self._slowed(task, attempt) if attempt.excess > 1 and task.at_rest else attempt
+        return self._measured(task, result.x, outcome, result.iterations)
+
+    def _measured(
+        self, task: Task, x: Array, outcome: Outcome, iterations: int = 0, *, at_any_cost: bool = False
+    ) -> Attempt:
+        """Look at a motion on the fine grid; slow it down if it may be and needs it."""
+        cost, excess = self.check.measure(task, x)
+        attempt = Attempt(x, excess.worst, cost, outcome, iterations)
+        return self._slowed(task, attempt, at_any_cost=at_any_cost) if attempt.excess > 1 and task.at_rest else attempt
 
     def _slowed(self, task: Task, attempt: Attempt, *, at_any_cost: bool = False) -> Attempt:
         motion = self.check.transcription(task)

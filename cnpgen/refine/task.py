@@ -77,6 +77,7 @@ class Attempt:
     Attributes:
         x: Variables of the transcription.
         excess: Worst violation on the fine grid, as a multiple of what is allowed; at most 1 is within the tolerances.
+            0 where nobody looked, since the iteration ended within its bounds.
         cost: Objective [s].
         outcome: What it would be called if it were the last.
         iterations: Steps that led to it.

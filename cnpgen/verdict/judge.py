@@ -22,7 +22,7 @@ from cnpgen.verdict.course import course
 from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
 from cnpgen.verdict.sampling import Samples, sample, time_table
-from cnpgen.verdict.verdict import Margin, Metrics, Reason, Verdict
+from cnpgen.verdict.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.verify.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -80,11 +80,13 @@ class Judge:
         self._problem, self._robot, self._step = problem, robot, step
         self._world = PathWorld(problem, robot)
 
-    def __call__(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[Verdict]:
-        """Judge N plans; arguments as of ``judge``."""
+    def __call__(
+        self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, brief: bool = False
+    ) -> list[Verdict]:
+        """Judge N plans; arguments as of ``judge``. A brief verdict has neither metrics nor the paper's rule."""
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
         with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
-            return [_judge_plan(plan, self._world, self._step) for plan in plans]
+            return [_judge_plan(plan, self._world, self._step, brief=brief) for plan in plans]
 
     def refutes(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[bool]:
         """Say of N plans whether a few samples show that they are not valid; of those that pass nothing is known."""
@@ -157,7 +159,7 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
         raise UsageError(f"splines of degree {motion.degree} need at least {motion.degree + 1} control points")
 
 
-def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
+def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
     samples = _samples(plan, step)
     if isinstance(samples, Verdict):
@@ -170,8 +172,10 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float) -> Verdict:
         *boundary_margins(states, plan.boundary, samples, world.robot.joint_names),
         *constraint_margins(plan.problem, world, samples),
     ]
-    metrics = _metrics(plan.problem, world, samples, states.jerk)
-    paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
+    metrics, paper = Metrics(), PaperRule()
+    if not brief:
+        metrics = _metrics(plan.problem, world, samples, states.jerk)
+        paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
     margins = keep_worse(margins, look_closer(plan.problem, world, plan.motion, samples, plan.tops))
     return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
 
