@@ -2,6 +2,8 @@
 
 Problems come from a seed that nothing was trained on. The clock is the process's CPU time, one BLAS thread; a plan's
 share of the verdict is in the refiner's time. "T / refined" is the mean motion time before over that after refining.
+The replanner is also asked for new plans on the way: from valid plans, after parts of their time T, to the goal that
+they have and to that of another problem; "T / left" is the mean time of the new plans over what was left of the old.
 
     python benchmarks/planners.py
     python benchmarks/planners.py --full      # as many problems as the targets are about
@@ -20,12 +22,14 @@ from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.refine.options import DEFAULT
+from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems
 from cnpgen.threads import one_thread
 
 PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000, "heavy-object": 300}
 GRID = "airhockey-hit"
 SHORT = {"planned": 500, "refined": 40}
+REPLANNER, WHEN = "airhockey-replan", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)  # parts of T
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,34 @@ def measure_grid(name: str) -> dict[str, float]:
     return {"grid, strict of 81": strict, "grid, refined valid of 81": sum(each.valid for each in made)}
 
 
+def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, Any]]:
+    """Plan anew from points on valid plans, to the same goal and to another one."""
+    planner = Planner(name)
+    plans = planner.plan_batch(draw_problems(name, planned, seed=seed).boundary)
+    plans, found = plans.select(evaluate_plans(plans).valid), []
+    others = np.roll(np.arange(len(plans)), 1)
+    for goal, ends in (("same", plans.boundary), ("another", plans.boundary[others])):
+        for when in WHEN:
+            progress(f"{name}: {len(plans)} plans replanned at {when:g} T to {goal} goal")
+            new = planner.replan(plans, when * plans.duration, goal_q=ends.goal_q, goal_dq=ends.goal_dq)
+            facts = {"goal": goal, "at": when, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
+            facts["refined valid"] = float(refine_plans(new.select(slice(refined))).valid.mean())
+            facts["T / left"] = float(new.duration.mean() / ((1 - when) * plans.duration.mean()))
+            found.append(facts)
+    return found
+
+
+def replan_table(found: list[dict[str, Any]]) -> str:
+    """Lay out what ``replan`` found."""
+    rows = [
+        (each["goal"], f"{each['at']:g} T", f"{each['valid']:.1%}", f"{each['refined valid']:.1%}",
+         f"{each['T / left']:.2f}" if each["goal"] == "same" else "")
+        for each in found
+    ]  # fmt: skip
+    head = ("goal", "at", "valid", "refined valid", "T / left")
+    return table(f"new plans from points on {found[0]['plans']} valid ones", head, rows, left=2)
+
+
 def measure(name: str, seed: int, planned: int, refined: int) -> dict[str, float]:
     progress(f"{name}: {planned} plans, {refined} of them refined")
     planner = Planner(name)
@@ -126,7 +158,12 @@ def main() -> None:
         found[name] = measure(name, chosen.seed, *sizes) | (measure_grid(name) if name == GRID else {})
     rows = [row for name, values in found.items() for row in rows_of(name, values)]
     head = ("planner", "figure", "value", "target", "", "of target")
-    report({"planners": found}, [table("shipped planners on fresh problems", head, rows, left=2)], as_json=chosen.json)
+    tables = [table("shipped planners on fresh problems", head, rows, left=2)]
+    again = []
+    if REPLANNER in chosen.models:
+        again = replan(REPLANNER, chosen.seed, *((1000, 200) if chosen.full else (200, 40)))
+        tables.append(replan_table(again))
+    report({"planners": found, "replanned": again}, tables, as_json=chosen.json)
 
 
 if __name__ == "__main__":
