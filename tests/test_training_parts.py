@@ -1,15 +1,19 @@
 """Schedule, order of rows, clipping and settings: each follows from little, and says what it refuses."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.losses.metric import Metric
 from cnpgen.losses.schedule import MetricSettings
+from cnpgen.network.architecture import Architecture
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.margins import suggested_margins
+from cnpgen.training.prepare import begin_run
 from cnpgen.training.schedule import learning_rate
 from cnpgen.training.settings import METRICS, Length, TrainingSettings
 from cnpgen.training.step_rows import StepRows
@@ -73,6 +77,7 @@ def test_without_a_limit_nothing_is_clipped():
     assert clipping.batch_factor(1.0, limit=math.inf) == clipping.batch_factor(1e30, limit=math.inf) == 1.0
 
 
+SIZES = ("inputs", "hidden", "layers", "path_outputs", "rate_outputs")
 WRONG: list[tuple[str, Any]] = [
     ("hidden", 0), ("hidden", 2.5), ("batch_size", -1), ("seed", -1), ("bending_steps", -1), ("nodes", "32"),
     ("learning_rate", 0.0), ("learning_rate", math.inf), ("learning_rate", "1e-3"), ("final_rate", -5),
@@ -99,6 +104,24 @@ def test_weights_that_grow_without_end_are_refused_by_what_was_said():
 def test_a_run_has_one_length(wrong):
     with pytest.raises(UsageError, match=r"how long|(steps|epochs|cpu_seconds) must be .*, got "):
         Length(**wrong)
+
+
+def test_a_busy_moment_does_not_make_a_run_short(monkeypatch):
+    """Steps are counted out by how long they usually take, not by what other jobs do to some of the measured ones."""
+    now, taken = [0.0], []
+
+    def step(_state: Any, _gradient: Any) -> None:
+        taken.append(len(taken))
+        now[0] += 0.5 if 12 <= len(taken) < 30 else 0.001
+
+    run = SimpleNamespace(
+        learner=SimpleNamespace(settings=TrainingSettings(), architecture=Architecture(**dict.fromkeys(SIZES, 2))),
+        names=("time", "table"),
+        metric=Metric([1.0], [0.0]),
+        step=step,
+    )
+    monkeypatch.setattr("cnpgen.training.prepare.time.process_time", lambda: now[0])
+    assert begin_run(run, Length(cpu_seconds=10.0)).steps == pytest.approx(10_000, abs=1)  # type: ignore[arg-type]
 
 
 def test_the_paper_s_form_of_the_loss_goes_with_the_paper_s_metric():

@@ -49,12 +49,7 @@ def prepare_run(
     """
     boundary = source.training()
     rest, spec = resting(boundary), given.problem.trajectory
-    kit = make_kit(
-        given,
-        bending_steps=settings.bending_steps,
-        landing_steps=settings.landing_steps,
-        slow_down=len(rest) == 3,  # all of them
-    )
+    kit = _kit(given, settings, slow_down=len(rest) == 3)  # all of them
     rows, features = prepare_rows(boundary, kit.prepare)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
@@ -74,6 +69,11 @@ def prepare_run(
         training={"command": command, **identity(source, settings), "stages": stages_of(source.dataset.plan)},
     )
     return run, kit
+
+
+def _kit(given: Surroundings, settings: TrainingSettings, *, slow_down: bool) -> Kit:
+    bending, landing = settings.bending_steps, settings.landing_steps
+    return make_kit(given, bending_steps=bending, landing_steps=landing, slow_down=slow_down)
 
 
 def identity(source: Source, settings: TrainingSettings) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def train_model(
     """Train a model, or go on with one that was interrupted; one that is there already is returned as it is.
 
     Beside the model there are a log, ``.jsonl``, and as long as it is not finished a checkpoint, ``.checkpoint``. Cut
-    off and resumed, a run gives the bits that it would have given uncut.
+    off and resumed, a run gives the parameters that it would have given uncut, to the bit.
 
     Args:
         folder: The dataset.
@@ -99,7 +99,7 @@ def train_model(
         journal = Journal(job.out.with_suffix(LOG), state.log)
         run.go_on(state, job.checkpoints, journal, watch)
         job.checkpoints.save(state)
-        return _kept(job, run.model(state.best.parameters), kit, state, journal, workers)
+        return _kept(job, run, state, kit=kit, journal=journal, workers=workers)
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,9 @@ def _job(folder: str | Path, out: Path, settings: TrainingSettings, lasts: Mappi
     return _Job(source, out, settings, length, check_rows, Checkpoints(out.with_suffix(CHECKPOINT), asked))
 
 
-def _kept(job: _Job, best: Model, kit: Kit, state: State, journal: Journal, workers: int | None) -> Trained:  # noqa: PLR0917
+def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: Journal, workers: int | None) -> Trained:
     """Judge the best model and write it; the log's last line is not in the checkpoint, so that it comes but once."""
+    best = run.model(state.best.parameters)
     score = validate(best, kit, job.source.judged(MOST_JUDGED, after=job.check_rows), workers=workers)
     journal.write({"step": state.adam.step, "best": state.best.step, "final": score})
     training = {**best.training, **job.checkpoints.identity, **_outcome(state, score)}
