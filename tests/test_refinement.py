@@ -18,6 +18,7 @@ from cnpgen.evaluation import evaluate_plans
 from cnpgen.make import make_dataset
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.problem import open_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.task import Outcome
 from cnpgen.refinement import refine_plans
@@ -81,6 +82,15 @@ def test_boundary_conditions_beyond_all_measure_leave_the_other_plans_alone(
     found = refine_plans(replace(few, boundary=huge), workers=1)
     assert found.valid.tolist() == [False, True, False]
     assert same(found.plans.select(np.array([1])), solved.select(np.array([1])))
+
+
+def test_boundary_conditions_that_break_a_limit_by_themselves_cost_one_pass(problems: Plans) -> None:
+    few, b = problems.select(np.arange(2)), problems.boundary[:2]
+    _, robot = open_problem(problems.problem)
+    faster = b.goal_dq * (1.02 / np.max(np.abs(b.goal_dq) / robot.velocity_limit, axis=1, keepdims=True))
+    found = refine_plans(replace(few, boundary=replace(b, goal_dq=faster)), workers=1)
+    assert [each.outcome for each in found.refined] == [Outcome.UNSOLVED] * 2
+    assert max(each.iterations for each in found.refined) <= RefineOptions().max_iterations
 
 
 def test_plans_that_take_days_are_made_as_if_there_were_none(problems: Plans, solved: Plans) -> None:

@@ -56,10 +56,9 @@ class Bounds:
         """How far residuals g are outside, shape (K, m); negative inside."""
         return np.maximum(g - self.upper, self.lower - g)
 
-    def beyond(self, ends: Array) -> float:
-        """By how much boundary states with residuals ``ends``, shape (2, m), are outside at worst."""
-        lower, upper = self.lower[[0, -2]], self.upper[[0, -2]]
-        return float(np.nanmax(np.maximum(ends - upper, lower - ends)))
+    def beyond(self, ends: Array) -> Array:
+        """By how much boundary states with residuals ``ends`` are outside, shape (2, m); nan where they are nan."""
+        return np.maximum(ends - self.upper[[0, -2]], self.lower[[0, -2]] - ends)
 
     def violation(self, g: Array) -> float:
         """Worst violation of residuals g, shape (K, m); inf where g is not finite."""

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 POINTS = 600
 ATTEMPTS = 6
 ROUNDING = 1e-12  # of scaled residuals; less cannot be told from what is exactly allowed
+CERTAIN = 1.5  # times what is allowed: the bounds near an end are not quite those at it
 LARGEST = 1.25  # a motion that must be slower than this is another motion: the optimiser finds a better one
 
 
@@ -82,6 +83,11 @@ class FineCheck:
         size = np.abs(np.where(high, g, 0.0)).max(axis=0, initial=0.0)
         speed, strength = (size[self._needs == needs].max(initial=1.0) for needs in (1, 2))
         return cost, Excess(worst, bool(high[:, self._needs == 0].any()), max(speed, float(np.sqrt(strength))))
+
+    def refutes_ends(self, task: Task) -> bool:
+        """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
+        bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)
+        return bool(np.nanmax(bounds.beyond(motion.end_residuals()) / np.maximum(self._allowed, ROUNDING)) > CERTAIN)
 
     def slow_down(
         self, task: Task, motion: Transcription, x: Array, *, at_any_cost: bool = False

@@ -156,6 +156,8 @@ class Refiner:
         else:
             best = self._measured(task, first.x, Outcome.SOLVED, first.iterations)
             yield best
+        if self.check.refutes_ends(task):
+            return
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
         yield polished
         if repaired is not None and repaired.outcome is Outcome.SLOWED and repaired.excess <= 1:
@@ -177,7 +179,7 @@ class Refiner:
         motion = self.transcription(task, which)
         ends = motion.end_residuals()
         bounds = self.bounds(task, which, ends)
-        if not bounds.beyond(ends) < LOST:
+        if not np.nanmax(bounds.beyond(ends)) < LOST:
             settings = replace(settings, max_iterations=0)
         return self._minimise(motion, bounds, x, settings)
 
