@@ -161,7 +161,7 @@ def main() -> None:
     tables = [table("shipped planners on fresh problems", head, rows, left=2)]
     again = []
     if REPLANNER in chosen.models:
-        again = replan(REPLANNER, chosen.seed, *((1000, 200) if chosen.full else (200, 40)))
+        again = replan(REPLANNER, chosen.seed, SHORT["planned"], SHORT["refined"])
         tables.append(replan_table(again))
     report({"planners": found, "replanned": again}, tables, as_json=chosen.json)
 
