@@ -12,11 +12,12 @@ from scipy.interpolate import BSpline
 
 from cnpgen.evaluation import evaluate_plans
 from cnpgen.planner.kit import make_kit
-from cnpgen.planner.slowing import SLOWEST, make_slowing
+from cnpgen.planner.slowing import PHASES, SLOWEST, make_slowing
 from cnpgen.plans.plans import make_plans
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import anchor_line, assemble
 from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline import chebyshev
 
 LIMITS = ("joint velocity", "joint acceleration", "joint torque")
 
@@ -124,14 +125,16 @@ def test_slowed_motions_meet_velocity_acceleration_and_torque_and_slightly_faste
     assert (np.max([faster[name] for name in LIMITS], axis=0)[needed] > 1).all()
 
 
-def test_a_first_look_finds_the_motions_that_need_to_be_slower_and_no_others(fast):
-    """The first look asks one number of every phase; what it lets pass must be within every bound, by the residuals."""
+def test_the_look_at_all_phases_finds_the_motions_that_need_to_be_slower_and_no_others(fast):
+    """One number tells of every phase whether the limits are kept there, as the limits themselves do."""
     given, _, _, motion, tops = fast
     slowing = make_slowing(given.problem, given.robot, given.kernels)
-    needed = slowing._needed(motion, tops)
+    needed = slowing.factor(motion, tops)
     for pace in (1.0, np.median(needed), 0.999 * needed.max(), 1.01 * needed.max()):
         slower = motion.slower(np.full(12, pace))
-        (values,) = slowing.residuals(*slowing._states(slower, tops, 1.0))
+        states = slower.at(chebyshev(PHASES))
+        lanes = [np.ascontiguousarray(part.reshape(-1, 7).T) for part in (states.q, states.dq, states.ddq)]
+        (values,) = slowing.residuals(*lanes, np.repeat(tops.T, states.q.shape[1], axis=1))
         out = np.maximum(values - slowing.upper[:, None], slowing.lower[:, None] - values).max(axis=0)
         (excess,) = slowing.excess(slowing._column(slower, tops))
         np.testing.assert_allclose(excess[0], out, atol=1e-9)

@@ -61,18 +61,14 @@ class Slowing:
         Returns:
             Shape (N,).
         """
-        if len(motion) <= BLOCK:
-            return self._block(motion, tops)
-        parts = [slice(first, first + BLOCK) for first in range(0, len(motion), BLOCK)]
-        return np.concatenate([self._block(motion[part], tops[part]) for part in parts])
-
-    def _block(self, motion: Motion, tops: Array) -> Array:
-        (excess,) = self.excess(self._column(motion, tops))
-        factor, over = np.ones(len(motion)), excess > 0
-        if over.any():  # most motions are slow enough, and one look tells
-            fast = np.flatnonzero(over.reshape(len(motion), -1).any(axis=1))
-            factor[fast] = self._needed(motion[fast], tops[fast])
-        return factor
+        factor, phases = np.ones(len(motion)), self.path.shape[1]
+        for block in (slice(first, first + BLOCK) for first in range(0, len(motion), BLOCK)):
+            column = self._column(motion[block], tops[block])
+            (excess,) = self.excess(column)
+            over = np.flatnonzero(excess[0] > 0)  # most motions are slow enough everywhere, and one look tells
+            if len(over):
+                np.maximum.at(factor[block], over // phases, self._needed(column.take(over, axis=1)))
+        return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
 
     def _column(self, motion: Motion, tops: Array) -> Array:
         """Lay out p, p', p'', r, r' and obstacles at all phases of N motions, shape (3 n + 2 + obstacles, N K)."""
@@ -84,23 +80,20 @@ class Slowing:
         out[3 * n + 2 :].reshape(-1, count, phases)[:] = tops.T[..., None]
         return out
 
-    def _needed(self, motion: Motion, tops: Array) -> Array:
-        """Smallest factors of motions that exceed a limit somewhere."""
-        fast, slow, rest = (self.residuals(*self._states(motion, tops, k))[0] for k in (1.0, 2.0, np.inf))
+    def _needed(self, column: Array) -> Array:
+        """Smallest factors that L of the columns of ``_column`` ask for, shape (L,)."""
+        n = self.residuals.tape.inputs[0]
+        p, p1, p2 = column[:n], column[n : 2 * n], column[2 * n : 3 * n]
+        (r, r1), tops = column[3 * n : 3 * n + 2], column[3 * n + 2 :]
+        dq, ddq = p1 * r, (p2 * r + p1 * r1) * r
+        fast, slow, rest = (self.residuals(p, dq / k, ddq / k**2, tops)[0] for k in (1.0, 2.0, np.inf))
         quadratic = 2 * (fast - 2 * slow + rest)  # c, from g(1) = rest + b + c and g(2) = rest + b / 2 + c / 4
         linear = fast - rest - quadratic
         needed = np.maximum(
             _smallest(self.upper[:, None] - rest, linear, quadratic),
             _smallest(rest - self.lower[:, None], -linear, -quadratic),
         )
-        factor: Array = needed.max(axis=0, initial=1.0).reshape(len(motion), -1).max(axis=1)
-        return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
-
-    def _states(self, motion: Motion, tops: Array, k: float) -> tuple[Array, Array, Array, Array]:
-        """Positions, velocities, accelerations and obstacles at all phases of motions k times as slow, samples last."""
-        p, p1, p2 = _lanes(self.path, motion.path)
-        r, r1 = _lanes(self.rate, motion.rate[..., None])
-        return p, p1 * r / k, (p2 * r + p1 * r1) * r / k**2, np.repeat(tops.T, self.path.shape[1], axis=1)
+        return np.asarray(needed.max(axis=0, initial=1.0))
 
 
 def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Slowing:
@@ -116,13 +109,6 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
     rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)])
     excess, residuals = kernels.load(speed_excess), kernels.load(speed_residuals)
     return Slowing(excess, residuals, *speed_bounds(robot, problem), path, rate)
-
-
-def _lanes(tables: Array, points: Array) -> Array:
-    """Evaluate N splines: from (m, K, C) and (N, C, n) to (m, n, N K)."""
-    count, phases, basis_functions = tables.shape
-    values = (tables.reshape(-1, basis_functions) @ points).reshape(len(points), count, phases, -1)
-    return np.ascontiguousarray(values.transpose(1, 3, 0, 2)).reshape(count, points.shape[2], -1)
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:
