@@ -38,7 +38,7 @@ def plan_text(recipe: "DatasetRecipe", *, force: bool, **settings: Any) -> str:
     splits = [f"{split} {rows:,}" for split, rows in plan.splits.items()]
     counts = [f"{split} {sum(task.split == split for task in files)}" for split in plan.splits]
     facts = [
-        ("folder", str(job.folder)),
+        ("folder", job.folder),
         ("state", folder_state(job.folder, plan, force=force)),
         ("rows", f"{sum(plan.splits.values()):,}: {', '.join(splits)}"),
         ("shards", f"{len(files)} of at most {plan.shard_size:,} rows: {', '.join(counts)}"),
