@@ -31,6 +31,7 @@ LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 LOST = 10.0  # boundary states further outside, in scaled units, are no problem for steps; DAQP may take hours over them
 EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the ends need the later one
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
+FROM_NOTHING = 0.2  # share of the tolerance for motions from nothing, where small steps still lead far
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,19 @@ class Refiner:
             yield self._slowed(task, best, at_any_cost=True)
 
     def minimise(self, task: Task, which: Pass, x: Array, *, warm: bool = False) -> Result:
-        """Run one pass from x."""
-        settings = replace(which.settings, radius=min(which.settings.radius, WARM_RADIUS)) if warm else which.settings
+        """Run one pass from x.
+
+        Args:
+            task: What to plan.
+            which: Grid, tightening and settings.
+            x: First variables.
+            warm: Whether they are those of a motion that is nearly right.
+        """
+        settings = which.settings
+        if warm:
+            settings = replace(settings, radius=min(settings.radius, WARM_RADIUS))
+        else:
+            settings = replace(settings, cost_tolerance=FROM_NOTHING * settings.cost_tolerance)
         motion = self.transcription(task, which)
         ends = motion.end_residuals()
         bounds = self.bounds(task, which, ends)
