@@ -9,6 +9,7 @@ from example_refiner import library, refine, refiner, refiner_of, task, tops, ve
 
 from cnpgen.errors import UsageError
 from cnpgen.recipes import TrajectorySpec
+from cnpgen.refine import sqp
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.grid import make_grid
@@ -278,3 +279,55 @@ def test_the_iteration_never_ends_worse_than_it_began() -> None:
     result = minimise(motion, bounds, x, Settings(max_iterations=5))
     merit = Settings().penalty
     assert result.cost + merit * result.violation <= cost + merit * bounds.violation(g) + 1e-12
+
+
+def test_an_iterate_lands_once_its_objective_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, tool = task(load("replan")), refiner("airhockey")
+    landed = tool.minimise(asked, tool.passes.first, tool.straight(asked))
+    monkeypatch.setattr(sqp, "LANDING", Settings().proximal)
+    wandered = tool.minimise(asked, tool.passes.first, tool.straight(asked))
+    assert landed.violation < Settings().violation_tolerance
+    assert landed.iterations < wandered.iterations
+    assert landed.cost < 1.003 * wandered.cost
+
+
+@pytest.mark.parametrize("label", LABELS)
+def test_a_refused_step_is_never_tried_again_as_it_was(label: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = load(label)
+    asked, tool = task(plan), refiner(plan.problem.name, Criterion("jerk", 1.0))
+    learn, refused = sqp._Descent._learn, []
+
+    def watch(descent: sqp._Descent, excess: np.ndarray, held: np.ndarray, size: float) -> None:
+        before = descent._radius, int(descent._missed.sum())
+        learn(descent, excess, held, size)
+        refused.append((before, (descent._radius, int(descent._missed.sum()))))
+
+    monkeypatch.setattr(sqp._Descent, "_learn", watch)
+    tool.minimise(asked, tool.passes.first, tool.straight(asked))
+    assert refused
+    assert all(after[0] < before[0] or after[1] > before[1] for before, after in refused)
+
+
+def test_what_a_transcription_remembers_is_of_the_variables_that_it_is_asked_about() -> None:
+    plan = load("hit")
+    criterion = Criterion("centrifugal", 0.01)
+    one = transcription(plan, 32, criterion=criterion)
+    x = one.pack(plan.motion.path[0], plan.motion.rate[0])
+    for asked in (x, x + 0.01, x.copy(), x):
+        value, at = one.value(asked), one.evaluate(asked)
+        fresh = transcription(plan, 32, criterion=criterion)
+        assert value[0] == pytest.approx(fresh.value(asked.copy())[0], rel=1e-14)
+        np.testing.assert_array_equal(at.gradient, fresh.evaluate(asked.copy()).gradient)
+        np.testing.assert_array_equal(value[1], fresh.value(asked.copy())[1])
+
+
+def test_a_first_pass_that_ends_within_its_bounds_is_offered_at_once_and_measured_only_if_refused() -> None:
+    plan = load("hit")
+    tool = refiner("airhockey")
+    attempts = tool.attempts(task(plan), None)
+    first, second = next(attempts), next(attempts)
+    assert (first.outcome, first.excess) == (Outcome.SOLVED, 0.0)
+    _, excess = tool.check.measure(task(plan), first.x)
+    assert second.outcome is Outcome.POLISHED
+    assert 0 < second.excess <= 1
+    assert excess.worst < 3

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,13 +85,35 @@ def test_boundary_conditions_beyond_all_measure_leave_the_other_plans_alone(
     assert same(found.plans.select(np.array([1])), solved.select(np.array([1])))
 
 
-def test_boundary_conditions_that_break_a_limit_by_themselves_cost_one_pass(problems: Plans) -> None:
+def test_boundary_conditions_that_break_a_limit_by_themselves_get_the_least_violation_but_no_other_start(
+    problems: Plans,
+) -> None:
     few, b = problems.select(np.arange(2)), problems.boundary[:2]
     _, robot = open_problem(problems.problem)
     faster = b.goal_dq * (1.02 / np.max(np.abs(b.goal_dq) / robot.velocity_limit, axis=1, keepdims=True))
     found = refine_plans(replace(few, boundary=replace(b, goal_dq=faster)), workers=1)
     assert [each.outcome for each in found.refined] == [Outcome.UNSOLVED] * 2
-    assert max(each.iterations for each in found.refined) <= RefineOptions().max_iterations
+    assert max(each.iterations for each in found.refined) <= 2 * RefineOptions().max_iterations  # of all four passes
+    margins = [each.margins["joint velocity"] for each in evaluate_plans(found.plans).verdicts]
+    assert [each.phase for each in margins] == [1.0, 1.0]
+    for each in margins:
+        assert each.value / each.bound == pytest.approx(1.02)
+    assert {each.reason for each in found.refined} == {"joint velocity limit"}
+
+
+def test_two_threads_refine_as_one_does() -> None:
+    transports = [draw_problems("heavy-object", 2, seed=seed) for seed in (3, 4)]
+    alone = [refine_plans(each, workers=1).plans for each in transports]
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(2):
+            together = list(pool.map(lambda each: refine_plans(each, workers=1).plans, transports))
+            assert all(same(one, other) for one, other in zip(together, alone, strict=True))
+
+
+def test_a_plan_that_is_far_out_of_bounds_is_made_as_if_there_were_none(problems: Plans, solved: Plans) -> None:
+    few = solved.select(slice(0, 3))
+    far = refine_plans(replace(few, path_control_points=few.path_control_points + 10), workers=1)
+    assert same(far.plans, few)
 
 
 def test_plans_that_take_days_are_made_as_if_there_were_none(problems: Plans, solved: Plans) -> None:

@@ -25,7 +25,7 @@ PROXIMAL = 0.1  # weight of sqpmethod's proximal term: it has no trust region
 NEAR = 0.03  # peaks this close to their bounds are held
 FAR = 1.0  # what is further from its bounds is not held on the coarser grid either: obstacles 0.1 m away
 QUIET = 8  # iterates among which the objective hardly changes end a run
-FIRST, LATER = 0.5, 0.05  # what hardly is in the first and in later runs, in multiples of the tolerance
+FIRST, LATER = 1.0, 0.1  # what hardly is in the first and in later runs, in multiples of the tolerance
 WARM = {
     "mu_strategy": "monotone",
     "mu_init": 1e-6,
@@ -161,7 +161,7 @@ def _options(solver: str, programme: Programme, settings: Settings, limit: int, 
             "mumps_scaling": 0,  # like the next, it costs half as much again as the factorisation
             "mumps_permuting_scaling": 0,
             "max_iter": limit,
-            "tol": settings.cost_tolerance / 1000,  # times the active residuals, what the barrier adds to the objective
+            "tol": settings.cost_tolerance / 500,  # times the active residuals, what the barrier adds to the objective
             "constr_viol_tol": settings.violation_tolerance / 2,
             **(WARM if warm else {"mu_strategy": "adaptive"}),
         }
@@ -173,7 +173,7 @@ def _options(solver: str, programme: Programme, settings: Settings, limit: int, 
         "qpsol_options": {"error_on_fail": False, "print_time": False},
         "max_iter": limit,
         "tol_pr": settings.violation_tolerance / 2,
-        "tol_du": settings.cost_tolerance * 2,
+        "tol_du": settings.cost_tolerance * 4,
         "print_header": False,
         "print_iteration": False,
         "print_status": False,

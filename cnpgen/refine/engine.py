@@ -1,6 +1,7 @@
 """Refining some plans in one process: the refiner of their problem is built once and kept."""
 
 from functools import lru_cache
+from threading import get_ident
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +35,7 @@ def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
         options: How to.
     """
     refiner = prepare(plans, options)
-    jury = _jury(plans.problem, plans.degree, options.step)
+    jury = _jury(plans.problem, plans.degree, options.step, get_ident())
     return [refine_task(refiner, jury, task) for task in tasks_of(plans)]
 
 
@@ -59,8 +60,9 @@ def tasks_of(plans: Plans) -> list[Task]:
     ]
 
 
-@lru_cache(maxsize=2)
-def _jury(record: ProblemRecord, degree: int, step: float) -> Jury:
+@lru_cache(maxsize=8)
+def _jury(record: ProblemRecord, degree: int, step: float, _thread: int) -> Jury:
+    """Return the jury of a thread: Pinocchio's and Coal's memory is not to be shared."""
     return Jury(*open_problem(record), degree=degree, step=step)
 
 

@@ -31,7 +31,9 @@ LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 LOST = 10.0  # boundary states further outside, in scaled units, are no problem for steps; DAQP may take hours over them
 EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the ends need the later one
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
-FROM_NOTHING = 0.2  # share of the tolerance for motions from nothing, where small steps still lead far
+WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
+FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
+FROM_NOTHING = 0.4  # share of the tolerance for motions from nothing, where small steps still lead far
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,14 @@ class Passes:
     """The passes of a problem.
 
     Attributes:
-        first: From a given plan or a straight line.
+        given: From a given plan.
+        first: From a straight line.
         polish: On a finer grid, from where the first pass ended.
         strict: The same with more room to every bound, where the verdict still finds something.
         other: From other starts.
     """
 
+    given: Pass
     first: Pass
     polish: Pass
     strict: Pass
@@ -66,10 +70,13 @@ def default_passes(problem: Problem, settings: Settings) -> Passes:
     gentle, edge = (1e-3, LATE) if crowded else (1e-4, EARLY)
     room = Tightening(limit=4e-3, gentle=gentle, clearance=1e-3, band=0.088, edge=edge)
     strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE)
-    short = replace(settings, radius=WARM_RADIUS, max_iterations=settings.max_iterations // 2)
-    longer = replace(settings, max_iterations=settings.max_iterations * 3 // 2)
+    near = replace(settings, radius=WARM_RADIUS)
+    short = replace(near, max_iterations=settings.max_iterations // 2)
+    cold = replace(settings, cost_tolerance=FROM_NOTHING * settings.cost_tolerance)
+    longer = replace(cold, max_iterations=settings.max_iterations * 3 // 2)
     return Passes(
-        Pass(128, room, settings),
+        Pass(128, room, replace(near, funnel=WIDE_FUNNEL, far=FAR)),
+        Pass(128, room, cold),
         Pass(256, room, short),
         Pass(256, strict, short),
         Pass(192, replace(room, edge=strict.edge), longer),
@@ -146,8 +153,8 @@ class Refiner:
             given: What ``given`` says of it.
         """
         if self.settings.max_iterations == 0:
-            x, outcome = (self.straight(task), Outcome.UNSOLVED) if given is None else (given, Outcome.KEPT)
-            yield self._measured(task, x, outcome, at_any_cost=given is not None)
+            x, outcome = (self.straight(task), Outcome.SOLVED) if given is None else (given, Outcome.KEPT)
+            yield self._measured(task, x, outcome, at_any_cost=True)
             return
         repaired = self._measured(task, given, Outcome.KEPT) if given is not None and task.at_rest else None
         first = self._first(task, given if repaired is None else repaired.x)
@@ -157,16 +164,18 @@ class Refiner:
         else:
             best = self._measured(task, first.x, Outcome.SOLVED, first.iterations)
             yield best
-        if self.check.refutes_ends(task):
-            return
-        polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED, warm=True)
+        polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED)
         yield polished
         if repaired is not None and repaired.outcome is Outcome.SLOWED and repaired.excess <= 1:
             yield repaired
         best = polished if polished.is_better(best) else best
-        strict = self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED, warm=True)
+        strict = self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED)
         yield strict
-        best = strict if strict.is_better(best) else best
+        if not self.check.refutes_ends(task):
+            yield from self._from_other_starts(task, strict if strict.is_better(best) else best)
+
+    def _from_other_starts(self, task: Task, best: Attempt) -> Iterator[Attempt]:
+        """Yield the dearest plans; ``best`` is the best one so far."""
         for start in self._other_starts(task):
             other = self._attempt(task, self.passes.other, _variables(start), Outcome.RESTARTED)
             yield other
@@ -174,21 +183,9 @@ class Refiner:
         if task.at_rest:  # what is left to be said of it is why no speed is slow enough
             yield self._slowed(task, best, at_any_cost=True)
 
-    def minimise(self, task: Task, which: Pass, x: Array, *, warm: bool = False) -> Result:
-        """Run one pass from x.
-
-        Args:
-            task: What to plan.
-            which: Grid, tightening and settings.
-            x: First variables.
-            warm: Whether they are those of a motion that is nearly right.
-        """
-        settings = which.settings
-        if warm:
-            settings = replace(settings, radius=min(settings.radius, WARM_RADIUS))
-        else:
-            settings = replace(settings, cost_tolerance=FROM_NOTHING * settings.cost_tolerance)
-        motion = self.transcription(task, which)
+    def minimise(self, task: Task, which: Pass, x: Array) -> Result:
+        """Run one pass from x."""
+        settings, motion = which.settings, self.transcription(task, which)
         ends = motion.end_residuals()
         bounds = self.bounds(task, which, ends)
         if not np.nanmax(bounds.beyond(ends)) < LOST:
@@ -208,15 +205,15 @@ class Refiner:
         return _variables(starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
 
     def _first(self, task: Task, x: Array | None) -> Result:
-        """Run the first pass from variables, or from a straight line where there are none that can be evaluated."""
+        """Run the first pass from variables, or from a straight line where there are none, or far off."""
         if x is not None:
-            result = self.minimise(task, self.passes.first, x, warm=True)
-            if result.violation < np.inf:
+            result = self.minimise(task, self.passes.given, x)
+            if result.violation < FAR:
                 return result
         return self.minimise(task, self.passes.first, self.straight(task))
 
-    def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, *, warm: bool = False) -> Attempt:
-        result = self.minimise(task, which, x, warm=warm)
+    def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome) -> Attempt:
+        result = self.minimise(task, which, x)
         return self._measured(task, result.x, outcome, result.iterations)
 
     def _measured(

@@ -30,7 +30,7 @@ NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the fir
 LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
-FUNNEL, NARROWER, WORTH = 2.0, 0.7, 0.1  # first width, what is left of it each time, share of the promised gain
+NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; share of the promised gain
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
@@ -43,6 +43,8 @@ class Settings:
         radius: First trust radius, infinity norm [rad and log].
         proximal: Weight of the proximal term.
         penalty: Weight of the worst violation in the merit function.
+        funnel: First width of the funnel, a violation.
+        far: A start that violates more is none.
         cost_tolerance: Relative change of the objective below which it has settled.
         violation_tolerance: Worst scaled violation of a feasible iterate.
         thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
@@ -52,7 +54,9 @@ class Settings:
     radius: float = 0.3
     proximal: float = 0.02
     penalty: float = 2.0
-    cost_tolerance: float = 1e-3
+    funnel: float = 0.3
+    far: float = np.inf
+    cost_tolerance: float = 5e-4
     violation_tolerance: float = 6e-4
     thin: int = 6
 
@@ -65,7 +69,7 @@ class Result:
     """Where the iteration ended.
 
     Attributes:
-        x: The last iterate that was accepted: the best one by the merit function.
+        x: The last iterate that was accepted.
         cost: Objective there.
         violation: Worst scaled violation there.
         iterations: Steps tried.
@@ -108,12 +112,12 @@ class _Descent:
         at = motion.evaluate(x)
         self._at: Evaluation | None = at
         self.x, self.cost, self.violation = x, at.cost, bounds.violation(at.g)
-        self.ended = not np.isfinite(self.violation)
+        self.ended = not self.violation < settings.far
         self._violations = [self.violation]
         self._motion, self._bounds, self._settings = motion, bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
-        self._radius, self._funnel = settings.radius, FUNNEL
+        self._radius, self._funnel = settings.radius, settings.funnel
         self._length = LARGEST  # of the last step, in the same norm
         self._multipliers: Array | None = None
         self._settled = False
@@ -137,8 +141,8 @@ class _Descent:
     def _is_stuck(self) -> bool:
         """Whether it was never feasible, and the least violation hardly falls any more."""
         before, recent = self._violations[:-PATIENCE], self._violations[-PATIENCE:]
-        least = min(before, default=0.0)
-        return least > self._settings.violation_tolerance and min(recent) > PROGRESS * least
+        least, enough = min(before, default=0.0), self._settings.violation_tolerance
+        return least > enough and min(recent) > max(PROGRESS * least, enough)
 
     def _held(self, at: Evaluation) -> Mask:
         """Choose the residuals of the next quadratic programme."""
@@ -184,8 +188,9 @@ class _Descent:
             self._learn(self._bounds.excess(g), held, size)
 
     def _learn(self, excess: Array, held: Mask, size: float) -> None:
-        """Hold what a refused step broke unseen; make the next one shorter if that was not the worst of it."""
-        broken = crests(excess, thin=self._settings.thin) & (excess > self._settings.violation_tolerance)
-        self._missed |= broken & ~held
-        if not excess[~held].max(initial=0.0) >= excess.max():
+        """Hold what a refused step broke unseen; make the next one shorter unless that was the worst of it."""
+        broken = excess > self._settings.violation_tolerance
+        unseen = crests(excess, thin=self._settings.thin) & broken & ~held
+        self._missed |= unseen
+        if not (unseen.any() and excess[unseen].max() >= excess.max()):
             self._radius = 0.35 * min(self._radius, size)
