@@ -153,11 +153,11 @@ class Refiner:
             given: What ``given`` says of it.
         """
         if self.settings.max_iterations == 0:
-            x, outcome = (self.straight(task), Outcome.SOLVED) if given is None else (given, Outcome.KEPT)
-            yield self._measured(task, x, outcome, at_any_cost=True)
+            yield self._slowed_only(task, given)
             return
         repaired = self._measured(task, given, Outcome.KEPT) if given is not None and task.at_rest else None
-        first = self._first(task, given if repaired is None else repaired.x)
+        x = given if repaired is None else repaired.x
+        first = self._first(task, x)
         if first.violation <= self.settings.violation_tolerance and not task.at_rest:
             yield Attempt(first.x, 0.0, first.cost, Outcome.SOLVED, first.iterations)  # most are; no need to measure
             best = self._measured(task, first.x, Outcome.SOLVED)
@@ -172,12 +172,16 @@ class Refiner:
         strict = self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED)
         yield strict
         if not self.check.refutes_ends(task):
-            yield from self._from_other_starts(task, strict if strict.is_better(best) else best)
+            yield from self._from_others(task, x, strict if strict.is_better(best) else best)
 
-    def _from_other_starts(self, task: Task, best: Attempt) -> Iterator[Attempt]:
-        """Yield the dearest plans; ``best`` is the best one so far."""
-        for start in self._other_starts(task):
-            other = self._attempt(task, self.passes.other, _variables(start), Outcome.RESTARTED)
+    def _slowed_only(self, task: Task, given: Array | None) -> Attempt:
+        x, outcome = (self.straight(task), Outcome.SOLVED) if given is None else (given, Outcome.KEPT)
+        return self._measured(task, x, outcome, at_any_cost=True)
+
+    def _from_others(self, task: Task, given: Array | None, best: Attempt) -> Iterator[Attempt]:
+        """Yield the dearest plans: from the given one with more care, and from other starts; ``best`` is so far."""
+        for x in [*([] if given is None else [given]), *self._other_starts(task)]:
+            other = self._attempt(task, self.passes.other, x, Outcome.RESTARTED)
             yield other
             best = other if other.is_better(best) else best
         if task.at_rest:  # what is left to be said of it is why no speed is slow enough
@@ -230,14 +234,15 @@ class Refiner:
         slowed = Attempt(x, excess.worst, cost, Outcome.SLOWED, attempt.iterations)
         return slowed if slowed.is_better(attempt) else attempt
 
-    def _other_starts(self, task: Task) -> list[tuple[Array, Array]]:
+    def _other_starts(self, task: Task) -> list[Array]:
         boundary, spec, limit = task.boundary, self.spec, self.robot.velocity_limit
-        return [
+        found = [
             starts.straight(boundary, limit, spec),
             starts.through(boundary, limit, spec, middle=self.robot.base),
             starts.smooth(boundary, limit, spec),
             starts.through(boundary, limit, spec, middle=self._middle),
         ]
+        return list(map(_variables, found))
 
 
 def _variables(start: tuple[Array, Array]) -> Array:
