@@ -40,7 +40,7 @@ from cnpgen.trajectory.motion import Motion
 
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")
 SMALL = {"fresh": (60, 60, 20), "ipopt": 4, "height": 30, "slsqp": 2, "workers": 100}
-FULL = {"fresh": (1000, 1000, 300), "ipopt": 30, "height": 200, "slsqp": 10, "workers": 400}
+FULL = {"fresh": (1000, 1000, 300), "ipopt": 30, "height": 200, "slsqp": 10, "workers": 1500}
 VALID = {"airhockey-hit": 0.995, "airhockey-replan": 0.995, "heavy-object": 0.97}
 LOSS = 1.005  # motion time in Ipopt's
 NARROW = 1e-4  # m, off the table's height
