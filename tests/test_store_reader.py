@@ -1,15 +1,20 @@
 """Reading rows back."""
 
+import os
 import pickle
 import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from test_store_example import PLAN, dataset, make_columns, make_shard
 
 from cnpgen.errors import DatasetError
+from cnpgen.loader.load import load_dataset
+from cnpgen.store import intact
+from cnpgen.store.files import file_sha256
 from cnpgen.store.plan import save_plan, shards
 from cnpgen.store.reader import open_dataset
 
@@ -69,11 +74,54 @@ def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
 def test_damaged_parts_are_refused(dataset: Path) -> None:
     path = dataset / shards(PLAN)[0].file
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(DatasetError, match=r"shard-00000\.h5 is damaged or cut off"):
+    with pytest.raises(
+        DatasetError, match=r"shard-00000\.h5 has \d+ bytes instead of \d+; run the same make-dataset command again"
+    ):
         open_dataset(dataset).read("train")
     (dataset / "manifest.json").write_text("{")
     with pytest.raises(DatasetError, match=r"manifest\.json is damaged"):
         open_dataset(dataset)
+
+
+def change_a_number(path: Path, field: str = "start_q") -> None:
+    """Overwrite bytes of a value in a committed shard: HDF5 notices nothing."""
+    with h5py.File(path) as file:
+        offset = file[field].id.get_offset()
+    content = bytearray(path.read_bytes())
+    content[offset + 3] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset: Path, finished: bool) -> None:
+    second = shards(PLAN)[1]
+    change_a_number(dataset / second.file)
+    if not finished:
+        (dataset / "manifest.json").unlink()
+    opened = open_dataset(dataset, allow_partial=not finished)
+    assert len(opened.read("train", stop=32)["start_q"]) == 32  # the other shard is good
+    with pytest.raises(DatasetError) as by_rows:
+        opened.read("train", start=40)
+    with pytest.raises(DatasetError) as by_shards:
+        list(opened.iter_shards("train"))
+    with pytest.raises(DatasetError) as by_loader:
+        load_dataset(dataset, allow_incomplete=not finished).arrays("train")
+    assert str(by_rows.value) == str(by_shards.value) == str(by_loader.value)
+    assert "shard-00001.h5 is damaged: its sha256 is not the recorded one; run the same" in str(by_rows.value)
+
+
+def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed: list[str] = []
+    monkeypatch.setattr(intact, "file_sha256", lambda path: (hashed.append(path.name), file_sha256(path))[1])
+    for _ in range(3):
+        open_dataset(dataset).read("train", stop=1)
+    assert hashed == ["shard-00000.h5"]
+    path = dataset / shards(PLAN)[0].file
+    change_a_number(path)
+    os.utime(path, ns=(0, 0))
+    with pytest.raises(DatasetError, match="sha256"):
+        open_dataset(dataset).read("train", stop=1)
+    assert hashed == ["shard-00000.h5"] * 2
 
 
 def test_a_folder_that_mixes_two_datasets_is_refused(tmp_path: Path, dataset: Path) -> None:

@@ -13,10 +13,10 @@ from cnpgen.errors import DatasetError
 from cnpgen.fields import Field
 from cnpgen.loader.columns import tail
 from cnpgen.store.files import file_sha256
+from cnpgen.store.intact import AGAIN, digest_problem, size_problem
 from cnpgen.store.shard import Placement, read_attributes, read_placements, read_shard
 
 MOST_MAPS = 32  # that are kept; each holds a file descriptor, and pages that the system may take back at any time
-AGAIN = "run the same make-dataset command again"
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,7 @@ class Shard:
 
     def problem(self) -> str:
         """Say what is wrong with the file without opening it; nothing if its size is right."""
-        if not self.path.is_file():
-            return f"{self.path} is missing"
-        size = self.path.stat().st_size
-        return "" if size == self.size else f"{self.path} has {size} bytes instead of {self.size}"
+        return size_problem(self.path, self.size)
 
 
 class ShardReader:
@@ -94,7 +91,7 @@ class ShardReader:
 
     def _check(self, shard: Shard) -> dict[str, Placement]:
         if self._verify and file_sha256(shard.path) != shard.sha256:
-            raise DatasetError(f"{shard.path} is damaged: its sha256 is not the recorded one; {AGAIN}")
+            raise DatasetError(f"{digest_problem(shard.path)}; {AGAIN}")
         found = read_attributes(shard.path, ["plan_key", "first_sample_id", "rows"])  # texts may hang HDF5: see there
         if found != {"plan_key": shard.key, "first_sample_id": shard.first_row, "rows": shard.rows}:
             raise DatasetError(f"{shard.path} is of another dataset or another place in it; {AGAIN}")

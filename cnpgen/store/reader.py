@@ -1,7 +1,8 @@
-"""Reading a dataset's rows back, for inspection and validation."""
+"""Reading a dataset's rows back: for inspection, for planners, for whoever wants them as they are stored."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, nearest
+from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
 from cnpgen.store.places import require_folder
 from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
-from cnpgen.store.record import is_committed
+from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard, storage_dtype
 from cnpgen.store.summary import summarise, unfinished
 
@@ -21,6 +23,8 @@ from cnpgen.store.summary import summarise, unfinished
 @dataclass(frozen=True, eq=False)
 class StoredDataset:
     """A dataset on disk; holds no open files, so it can be pickled and used in any process.
+
+    The sha256 of every shard is compared with the recorded one before its rows are first given.
 
     Attributes:
         folder: Its folder.
@@ -62,7 +66,7 @@ class StoredDataset:
         """
         names = self._names(fields)
         for task in self.tasks(split):
-            yield task, read_shard(self.folder / task.file, names)
+            yield task, self._read(task, names)
 
     def read(
         self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None
@@ -91,10 +95,25 @@ class StoredDataset:
         for task in tasks:
             low, high = max(start - task.first_row, 0), min(stop - task.first_row, task.rows)
             if low < high:
-                columns = read_shard(self.folder / task.file, names)
+                columns = self._read(task, names)
                 for name in names:
                     parts[name].append(columns[name][low:high])
         return {name: np.concatenate(items) for name, items in parts.items()}
+
+    def _read(self, task: ShardTask, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Read fields of a shard that is the recorded one."""
+        path = self.folder / task.file
+        size, sha256 = self._recorded.get(task.file) or _of_sidecar(self.folder, task)
+        require_intact(path, size=size, sha256=sha256)
+        return read_shard(path, names)
+
+    @cached_property
+    def _recorded(self) -> dict[str, tuple[int, str]]:
+        """Shard -> its size [bytes] and sha256, as the manifest lists them; empty while there is none."""
+        splits = {} if self.manifest is None else self.manifest["splits"]
+        return {
+            entry["file"]: (entry["bytes"], entry["sha256"]) for split in splits.values() for entry in split["shards"]
+        }
 
     def _names(self, fields: Sequence[str] | None) -> list[str]:
         return [self.plan.field_named(name).name for name in fields] if fields else [f.name for f in self.plan.fields]
@@ -102,6 +121,12 @@ class StoredDataset:
     def _no_rows(self, name: str) -> NDArray[Any]:
         field = self.plan.field_named(name)
         return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.plan.dtype))
+
+
+def _of_sidecar(folder: Path, task: ShardTask) -> tuple[int, str]:
+    """Return size [bytes] and sha256 of a shard as its sidecar has them."""
+    record = load_record(folder, task)
+    return record.bytes, record.sha256
 
 
 def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDataset:
