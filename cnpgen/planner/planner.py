@@ -16,6 +16,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans.plans import Plans
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.moment import states_at_times
 
 Array = NDArray[np.float64]
 
@@ -168,6 +169,4 @@ def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
         raise UsageError(
             f"plan {row} lasts from 0 to {plans.duration[row]:.6g} s, it cannot be evaluated at {times[row]:.6g} s"
         )
-    motion = plans.motion
-    states = motion.at(motion.phase_at(times[:, None]))
-    return states.q[:, 0], states.dq[:, 0], states.ddq[:, 0]
+    return states_at_times(plans.motion, times)

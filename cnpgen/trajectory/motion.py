@@ -1,6 +1,7 @@
 """N motions of one robot: positions and their derivatives in time, duration, time as a function of phase."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from cnpgen.trajectory.spline import basis, graded_edges, horner, lowest, pick, 
 Array = NDArray[np.float64]
 BLOCK = 16_384  # numbers
 _NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2  # on [0, 1]
+_NODES_AND_END = np.append(_NODES, 1.0)[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Motion:
 
     def duration(self) -> Array:
         """Duration ``T = integral of 1 / r`` [s], shape (N,); inf where r is not positive, nan where not finite."""
-        total = self.time_at(np.ones(1))[:, 0]
+        total = self._times_at(*_quadrature(self.rate.shape[1], self.degree))[:, -1].copy()
         total[~self.runs_forward()] = np.inf
         total[~np.isfinite(self.rate).all(axis=1)] = np.nan
         return total
@@ -106,15 +108,17 @@ class Motion:
             Shape (N, K); without meaning where r is not positive.
         """
         edges = np.union1d(graded_edges(self.rate.shape[1], self.degree), s)
-        width = np.diff(edges)
-        points = edges[:-1, None] + width[:, None] * _NODES
-        table, found = basis(points.ravel(), self.rate.shape[1], self.degree).T, np.searchsorted(edges, s)
-        times = np.empty((len(self), len(s)))
-        for block in self._blocks(points.size):
+        table = _nodes_of(edges, self.rate.shape[1], self.degree)
+        return self._times_at(edges, table)[:, np.searchsorted(edges, s)]
+
+    def _times_at(self, edges: Array, table: Array) -> Array:
+        """Time at edges of cells, shape (N, edges), from the basis at their Gauss nodes, shape (R, cells x 8)."""
+        width, times = np.diff(edges), np.zeros((len(self), len(edges)))
+        for block in self._blocks(table.shape[1]):
             with np.errstate(all="ignore"):  # garbage in, garbage out
                 inverse = 1.0 / (self.rate[block, None] @ table)  # one product per motion: the same bits in any batch
-                total = np.cumsum(inverse.reshape(-1, *points.shape) @ _WEIGHTS * width, axis=1)
-            times[block] = np.pad(total, [(0, 0), (1, 0)])[:, found]
+                cells = inverse.reshape(-1, len(width), len(_WEIGHTS)) @ _WEIGHTS * width
+                np.cumsum(cells, axis=1, out=times[block, 1:])
         return times
 
     def phase_at(self, t: Array) -> Array:
@@ -126,11 +130,11 @@ class Motion:
         Returns:
             Shape (N, K), exactly 0 and 1 at the ends; without meaning where r is not positive.
         """
-        blocks = self._blocks(t.shape[1])
+        blocks = self._blocks(len(_NODES) * t.shape[1])
         if len(blocks) > 1:
             return np.concatenate([self[block].phase_at(t[block]) for block in blocks])
-        edges = graded_edges(self.rate.shape[1], self.degree)
-        known = self.time_at(edges)
+        edges, table = _quadrature(self.rate.shape[1], self.degree)
+        known = self._times_at(edges, table)
         with np.errstate(all="ignore"):
             t = np.clip(t, 0.0, known[:, -1:])
             found = [np.searchsorted(row, times, side="right") for row, times in zip(known, t, strict=True)]
@@ -142,8 +146,9 @@ class Motion:
             ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
             done = np.zeros(t.shape, bool)
             for _ in range(30):  # three or four, unless r is not positive
-                nodes = (weight / horner(rate, offset + ahead * x) for x, weight in zip(_NODES, _WEIGHTS, strict=True))
-                new = np.clip(ahead + (left - ahead * sum(nodes)) * horner(rate, offset + ahead), 0.0, width)
+                *nodes, end = _values(rate, offset + ahead * _NODES_AND_END)
+                taken = ahead * sum(weight / value for value, weight in zip(nodes, _WEIGHTS, strict=True))
+                new = np.clip(ahead + (left - taken) * end, 0.0, width)
                 ahead, done = np.where(done, ahead, new), done | ~(np.abs(new - ahead) > 1e-15)
                 if done.all():
                     break
@@ -160,6 +165,26 @@ class Motion:
         """Split the motions so that arrays of shape (block, columns) stay in the cache."""
         size = max(BLOCK // max(columns, 1), 1)
         return [slice(first, first + size) for first in range(0, len(self), size)]
+
+
+@cache
+def _quadrature(points: int, degree: int) -> tuple[Array, Array]:
+    """Return the edges of the cells that ``t(s)`` is integrated over, and the basis of r at their Gauss nodes."""
+    edges = graded_edges(points, degree)
+    return edges, _nodes_of(edges, points, degree)
+
+
+def _nodes_of(edges: Array, points: int, degree: int) -> Array:
+    nodes = edges[:-1, None] + np.diff(edges)[:, None] * _NODES
+    return basis(nodes.ravel(), points, degree).T
+
+
+def _values(picked: Array, offset: Array) -> Array:
+    """Evaluate polynomials that ``pick`` returned, shape (D + 1, N, K), each at M offsets, shape (M, N, K)."""
+    value = np.zeros_like(offset)
+    for coefficients in picked:
+        value = value * offset + coefficients
+    return value
 
 
 def _states(p: list[Array], r: list[Array]) -> States:

@@ -47,7 +47,7 @@ def pieces(control: Array, degree: int) -> Array:
     """
     matrices = taylor(control.shape[1], degree)[::-1]
     columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
-    powers = np.stack([np.moveaxis(matrix @ columns, 0, 1) for matrix in matrices])  # motion by motion
+    powers = np.ascontiguousarray((matrices[:, None] @ columns).swapaxes(1, 2))  # motion by motion
     return powers.reshape(*matrices.shape[:2], len(control), *control.shape[2:])
 
 
