@@ -146,9 +146,9 @@ class Motion:
             ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
             done = np.zeros(t.shape, bool)
             for _ in range(30):  # three or four, unless r is not positive
-                *nodes, end = _values(rate, offset + ahead * _NODES_AND_END)
-                taken = ahead * sum(weight / value for value, weight in zip(nodes, _WEIGHTS, strict=True))
-                new = np.clip(ahead + (left - taken) * end, 0.0, width)
+                values = _values(rate, offset + ahead * _NODES_AND_END)
+                taken = ahead * sum(_WEIGHTS[:, None, None] / values[:-1])  # node by node: the same bits in any batch
+                new = np.minimum(np.maximum(ahead + (left - taken) * values[-1], 0.0), width)
                 ahead, done = np.where(done, ahead, new), done | ~(np.abs(new - ahead) > 1e-15)
                 if done.all():
                     break
