@@ -21,6 +21,7 @@ from cnpgen.refine.journal import Journal, open_journal
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.threads import one_thread
+from cnpgen.wording import counted
 from cnpgen.workers import share_out, worker_count
 
 FORMAT = "cnpgen-refinement"
@@ -45,6 +46,12 @@ class Refinement:
     given: Plans
     plans: Plans
     refined: tuple[Refined, ...]
+
+    def __repr__(self) -> str:
+        outcomes = _counted(each.outcome.name.lower() for each in self.refined)
+        how = ", ".join(f"{count:,} {name}" for name, count in outcomes.items())
+        plans = f"{counted(len(self.refined), 'plan')} of {self.plans.problem.name!r}"
+        return f"<{plans} refined, {int(self.valid.sum()):,} valid{how and ': '}{how}>"
 
     @property
     def valid(self) -> NDArray[np.bool_]:

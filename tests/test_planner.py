@@ -123,6 +123,17 @@ def test_a_planner_goes_to_other_processes_without_its_kernels(planner, rows):
     np.testing.assert_allclose(found, planned(planner, rows).path_control_points, atol=1e-5)
 
 
+def test_planners_models_and_plans_say_in_a_line_what_they_are(planner, rows):
+    size = f"{planner.model.architecture.layers} x {planner.model.architecture.hidden}"
+    assert repr(planner) == f"<Planner for 'airhockey': a network of {size}>"
+    assert repr(planner.model) == f"<Model of 'airhockey': a network of {size}>"
+    plans = planned(planner, rows)
+    assert repr(plans) == "<40 plans of 'airhockey': 40 unknown>"
+    status = np.array([1, 1, 2], np.uint8)
+    assert repr(replace(plans.select(slice(0, 3)), status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
+    assert repr(plans.select(slice(0, 0))) == "<0 plans of 'airhockey'>"
+
+
 @pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
 def test_what_is_no_model_is_refused_by_its_value(wrong):
     with pytest.raises(UsageError, match=f"a model is a name or a path, got {wrong!r}"):

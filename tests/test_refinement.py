@@ -49,6 +49,16 @@ def test_what_is_solved_is_valid_by_evaluate_and_says_so(solved: Plans) -> None:
     assert evaluate_plans(solved).valid.all()
 
 
+def test_a_refinement_is_printed_as_one_line(problems: Plans) -> None:
+    found = refine_plans(problems.select(slice(0, 2)), workers=1)
+    outcomes = {each.outcome.name.lower() for each in found.refined}
+    text = repr(found)
+    assert text.startswith("<2 plans of 'airhockey' refined, 2 valid: ")
+    assert all(outcome in text for outcome in outcomes)
+    assert len(text) < 120
+    assert "\n" not in text
+
+
 def test_neither_workers_nor_the_order_of_the_plans_change_anything(problems: Plans, solved: Plans) -> None:
     shuffled = np.random.default_rng(0).permutation(N)
     again = refine_plans(problems.select(shuffled), workers=2).plans
@@ -187,8 +197,14 @@ def test_drawn_problems_are_those_of_the_seed_and_of_no_other_split(tmp_path: Pa
         load_problems(made.folder, split="trian")
     with pytest.raises(UsageError, match=r"has \d+ rows, got 1000 from row 0 on"):
         load_problems(made.folder, split="validation", n=1000)
-    with pytest.raises(UsageError, match="n must be at least 1, got 0"):
+    with pytest.raises(UsageError, match="n must be an integer from 1 on, got 0"):
         draw_problems("airhockey-hit", 0)
+    with pytest.raises(UsageError, match=r"n must be an integer from 1 on, got 2\.5"):
+        draw_problems("airhockey-replan", 2.5)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="seed must be an integer from 0 to"):
+        draw_problems("airhockey-replan", 1, seed=-1)
+    with pytest.raises(UsageError, match=r"start must be an integer from 0 on, got 1\.0"):
+        load_problems(made.folder, start=1.0)  # type: ignore[arg-type]
 
 
 def test_plans_of_a_folder_are_called_after_it(

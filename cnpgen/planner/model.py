@@ -69,6 +69,10 @@ class Model:
     training: Mapping[str, Any] = field(default_factory=dict)
     log: str = ""
 
+    def __repr__(self) -> str:
+        size = f"{self.architecture.layers} x {self.architecture.hidden}"
+        return f"<Model of {self.problem.name!r}: a network of {size}>"
+
     def outputs(self, tasks: Tasks) -> Outputs:
         """Ask the network for N tasks: in float32 itself, sums and the exponential in float64."""
         given = forward(self._weights, self.features.of(tasks))

@@ -56,6 +56,11 @@ class Planner:
             self._still = {"start_dq": AT_REST * velocity, "start_ddq": AT_REST * acceleration}
             self._still["goal_dq"] = self._still["start_dq"]
 
+    def __repr__(self) -> str:
+        network = self.model.architecture
+        size = f"{network.layers} x {network.hidden}"
+        return f"<Planner for {self.model.problem.name!r}: a network of {size}>"
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without kernels: they are loaded anew where the planner goes."""
         return partial(type(self), **self._options), (self.model,)

@@ -16,6 +16,7 @@ from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.wording import counted
 
 Array = NDArray[np.float64]
 
@@ -53,6 +54,12 @@ class Plans:
 
     def __len__(self) -> int:
         return len(self.path_control_points)
+
+    def __repr__(self) -> str:
+        names = {status: status.name.lower() for status in PlanStatus}
+        known = Counter(names.get(status, "unknown") for status in self.status.tolist())
+        counts = ", ".join(f"{count:,} {name}" for name, count in known.most_common())
+        return f"<{counted(len(self), 'plan')} of {self.problem.name!r}{counts and ': '}{counts}>"
 
     @property
     def motion(self) -> Motion:
