@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_dataset_recipe
+from cnpgen.library import dataset_recipe_of
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.recipes import DatasetRecipe
@@ -57,10 +58,12 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
 
     Raises:
         DatasetError: The folder holds no readable dataset.
-        UsageError: There is no such split, or it has no such rows.
+        UsageError: There is no such folder or split, or it has no such rows.
     """
     from cnpgen.store.reader import open_dataset
 
+    start = integer("start", start, least=0)
+    n = None if n is None else integer("n", n, least=1)
     dataset = open_dataset(Path(folder))
     if split not in dataset.plan.splits:
         raise UsageError(f"{folder} has no split {split!r}: expected one of {', '.join(dataset.plan.splits)}")
@@ -82,18 +85,18 @@ def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | Non
 
     Raises:
         RecipeError: The recipe has mistakes.
-        UsageError: ``n`` is not positive.
+        UsageError: ``n`` is no positive integer, ``seed`` no integer from 0 to 2^63 - 1, or ``recipe`` no recipe.
         MachineError: No backend works.
     """
     from cnpgen.pipelines.prepared import PreparedPipeline
 
-    if n < 1:
-        raise UsageError(f"n must be at least 1, got {n}")
-    loaded = recipe if isinstance(recipe, DatasetRecipe) else load_dataset_recipe(recipe)
+    n = integer("n", n, least=1)
+    root = None if seed is None else integer("seed", seed, least=0, most=2**63 - 1)
+    loaded = dataset_recipe_of(recipe)
     backend, cache_folder = choose_backend(None)
     prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")
     rows = prepared.block_rows
-    root = loaded.seed if seed is None else seed
+    root = loaded.seed if root is None else root
     parts = [
         prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)).columns
         for index in range(-(-n // rows))

@@ -18,8 +18,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.errors import DatasetError, RecipeError, UsageError
+from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
 from cnpgen.library import load_problem
+from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.plans import (
     Plans,
     PlanStatus,
@@ -500,6 +501,69 @@ def test_plans_that_do_not_fit_are_not_joined(others: dict[str, Any], message: s
         concatenate([draw_plans(), draw_plans(**others)])
     with pytest.raises(UsageError, match="no plans to join"):
         concatenate([])
+
+
+@pytest.mark.parametrize(
+    ("which", "message"),
+    [
+        (np.ones(3, bool), r"a mask must have shape \(7,\) as there are 7 plans, got \(3,\)"),
+        (np.array([0, 7]), "there is no plan 7: 7 plans are numbered from 0"),
+        (np.array([-8]), "there is no plan -8"),
+        (np.array([0.0]), r"selected by a mask, integers or a slice, got float64 of shape \(1,\)"),
+        (np.array(2), r"selected by a mask, integers or a slice, got int64 of shape \(\)"),
+    ],
+)
+def test_plans_that_are_not_there_cannot_be_selected(which: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        draw_plans().select(which)
+
+
+def test_no_plans_can_be_selected() -> None:
+    assert len(draw_plans().select(np.array([]))) == len(draw_plans().select(slice(0, 0))) == 0
+
+
+@pytest.mark.parametrize("name", ["start_q", "goal_dq"])
+def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(name: str) -> None:
+    plans = draw_plans()
+    points = {each: getattr(plans, each) for each in ("path_control_points", "rate_control_points")}
+    others = replace(plans.boundary, **{name: np.zeros((N, 7))})
+    with pytest.raises(UsageError, match=rf"{name} must have shape \(7, 6\) \(plans, joints\), got \(7, 7\)"):
+        make_plans(plans.problem, others, **points)
+    with pytest.raises(UsageError, match=f"{name} must be an array of numbers with rows of equal length"):
+        make_plans(plans.problem, replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}), **points)
+
+
+@pytest.mark.parametrize("content", [b"precious", b"cnpgen-model 1\n", b"\x89HDF\r\n\x1a\n", "shard"])
+def test_only_files_of_plans_are_replaced(tmp_path: Path, content: bytes | str) -> None:
+    path = tmp_path / "mine.h5"
+    if isinstance(content, str):
+        with h5py.File(path, "w") as file:
+            file.attrs["format"] = "cnpgen-shard"
+    else:
+        path.write_bytes(content)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=r"mine\.h5 is .*not .*of plans: it is not replaced"):
+        save_plans(path, draw_plans())
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.iterdir()] == ["mine.h5"]
+
+
+def test_plans_of_anybody_and_empty_files_are_replaced_and_folders_are_made(tmp_path: Path) -> None:
+    theirs = write_minimal(tmp_path / "theirs.h5")
+    (tmp_path / "empty.h5").touch()
+    for path in (theirs, theirs, tmp_path / "empty.h5", tmp_path / "new" / "folder" / "plans.h5"):
+        save_plans(path, draw_plans())
+        assert_equal(load_plans(path), draw_plans())
+    with pytest.raises(UsageError, match="new is a folder, expected a file for plans"):
+        save_plans(tmp_path / "new", draw_plans())
+
+
+def test_a_model_is_said_to_be_one(tmp_path: Path) -> None:
+    path = tmp_path / "mine.h5"
+    save_model(path, load_model("airhockey-hit"))
+    for use in (load_plans, lambda path: save_plans(path, draw_plans())):
+        with pytest.raises(CnpgenError, match=r"mine\.h5 is a model of cnpgen, not (a file|one) of plans"):
+            use(path)
 
 
 def test_sizes_and_degrees_that_differ_are_not_joined() -> None:

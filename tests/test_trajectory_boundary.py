@@ -1,6 +1,7 @@
 """Boundary control points: exact in time, by SciPy's derivatives and the chain rule written out here."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -132,3 +133,13 @@ def test_a_path_of_a_single_span_is_refused() -> None:
         start_points(boundary, np.ones((N, 8)), spec)
     assert assemble(boundary, np.zeros((N, 4, JOINTS)), np.ones((N, 8)), TrajectorySpec(
         degree=7, path_control_points=9, rate_control_points=8)).shape == (N, 9, JOINTS)  # fmt: skip
+
+
+def test_conditions_of_different_joints_are_refused_by_name() -> None:
+    random = np.random.default_rng(2)
+    spec = draw_spec(random)
+    rate = np.ones((N, spec.rate_control_points))
+    mixed = replace(draw_boundary(random, goal_ddq=False), goal_q=np.zeros((N, JOINTS + 1)))
+    for points in (start_points, goal_points):
+        with pytest.raises(UsageError, match=f"same joints, got of each: start_q {JOINTS}, .*goal_q {JOINTS + 1}"):
+            points(mixed, rate, spec)

@@ -113,11 +113,13 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
 def check_place(out: Path, *, force: bool) -> None:
     """Refuse before any work what would fail, or destroy something, after it."""
     from cnpgen.errors import UsageError
+    from cnpgen.plans.save import check_replaceable
 
     if out.is_dir() or not out.parent.is_dir():
         raise UsageError(f"{out} must be a file in a folder that exists")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")
+    check_replaceable(out)
 
 
 def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, seconds: float) -> None:

@@ -7,8 +7,9 @@ from typing import Any
 from cnpgen.arguments import flag
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
-from cnpgen.loader.shards import AGAIN, Shard, ShardReader
+from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.store.documents import load_document
+from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.plan import DatasetPlan

@@ -17,6 +17,7 @@ from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
 from cnpgen.store.heaps import opened_foreign_hdf5
+from cnpgen.store.kinds import file_kind
 from cnpgen.store.places import require_file
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.wording import counted
@@ -45,6 +46,8 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
     path = Path(path)
     wanted = None if problem is None else record_problem(_loaded(problem))
     require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
+    if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
+        raise DatasetError(f"{path} is {kind}, not a file of plans")
     with opened_foreign_hdf5(path) as file:
         attributes = {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
         _check_format(path, attributes)

@@ -76,7 +76,11 @@ class Plans:
 
         Args:
             which: A mask of shape (N,), indices in any order, or a slice.
+
+        Raises:
+            UsageError: The mask has another length, or there are no such plans.
         """
+        which = _checked(which, len(self))
         return replace(
             self,
             boundary=self.boundary[which],
@@ -116,15 +120,16 @@ def make_plans(
         UsageError: Something has the wrong shape.
     """
     record = problem if isinstance(problem, ProblemRecord) else record_problem(problem)
-    path = np.asarray(path_control_points, np.float64)
+    path = _floats("path_control_points", path_control_points)
+    parts = {name: None if part is None else _floats(name, part) for name, part in vars(boundary).items()}
     rows = path.shape[0] if path.ndim else 0
     plans = Plans(
         problem=record,
-        boundary=Boundary(*(None if part is None else np.asarray(part, np.float64) for part in _parts(boundary))),  # type: ignore[arg-type]
+        boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
-        rate_control_points=np.asarray(rate_control_points, np.float64),
+        rate_control_points=_floats("rate_control_points", rate_control_points),
         degree=record.trajectory.degree if degree is None else degree,
-        columns={name: np.asarray(values, np.float64) for name, values in (columns or {}).items()},
+        columns={name: _floats(name, values) for name, values in (columns or {}).items()},
         sample_id=np.arange(rows) if sample_id is None else np.asarray(sample_id, np.int64),
         status=np.zeros(rows, np.uint8) if status is None else np.asarray(status, np.uint8),
     )
@@ -172,6 +177,31 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
     found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
     return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
+
+
+def _floats(name: str, values: ArrayLike) -> Array:
+    """Return values as an array of floats, nan included."""
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name} must be an array of numbers with rows of equal length: {error}") from error
+
+
+def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
+    """Return what is selected as a slice or an array of shape (k,), if there are such plans."""
+    if isinstance(which, slice):
+        return which
+    found = np.asarray(which)
+    found = found.astype(np.int64) if found.size == 0 and found.dtype.kind == "f" else found  # an empty list
+    if found.ndim != 1 or found.dtype.kind not in "biu":
+        raise UsageError(f"plans are selected by a mask, integers or a slice, got {found.dtype} of shape {found.shape}")
+    if found.dtype.kind == "b":
+        if len(found) != plans:
+            raise UsageError(f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}")
+    elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
+        wrong = int(found.max() if found.max() >= plans else found.min())
+        raise UsageError(f"there is no plan {wrong}: {plans} plans are numbered from 0")
+    return found
 
 
 def _parts(boundary: Boundary) -> list[Array | None]:

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, plan_fields
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files import write_file
+from cnpgen.store.kinds import PLANS, file_kind
 from cnpgen.store.shard import create_hdf5, field_attributes
 
 
@@ -19,14 +21,17 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     """Write plans to a file, atomically; equal plans give equal bytes.
 
     Args:
-        path: Where to; a file that is there is replaced.
+        path: Where to; a file of plans that is there is replaced, and folders that are missing are made (which
+            commands do not).
         plans: The plans.
 
     Raises:
+        UsageError: Something else than a file of plans is there.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
     import h5py
 
+    check_replaceable(Path(path))
     buffer = io.BytesIO()
     fields = plan_fields(plans.problem.joint_names)
     with h5py.File(create_hdf5(buffer)) as file:
@@ -37,6 +42,22 @@ def save_plans(path: str | Path, plans: Plans) -> None:
         _write_attributes(file["status"], {"flag_meanings": " ".join(status.name.lower() for status in PlanStatus)})
         _write_attributes(file, _attributes(plans))
     write_file(Path(path), buffer.getvalue())
+
+
+def check_replaceable(path: Path) -> None:
+    """Refuse to put plans in the place of anything but an older file of plans, or of an empty one.
+
+    Raises:
+        UsageError: Something else is there.
+    """
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder, expected a file for plans")
+    if not path.exists() or (path.is_file() and path.stat().st_size == 0):
+        return
+    kind = file_kind(path)
+    if kind != PLANS:
+        what = f"{kind}, not one of plans" if kind else "not a file of plans"
+        raise UsageError(f"{path} is {what}: it is not replaced; remove it, or choose another file")
 
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
