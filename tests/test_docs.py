@@ -79,6 +79,23 @@ def test_the_blocks_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
             run([sys.executable, "-c", text], tmp_path)
 
 
+WRITTEN = {
+    "bash": re.compile(r"(?:-o|--out|--plot|>) ([\w.-]+)"),
+    "python": re.compile(r'(?:save_plans\("|make_dataset\("[\w-]+", "|File\("(?=[^"]+", "w"))([\w.-]+)'),
+}
+
+
+def test_no_two_pages_write_the_same_file_so_that_all_can_run_in_one_folder() -> None:
+    pages: dict[str, set[str]] = {}
+    for page in PAGES:
+        for marks, language, text in blocks(page):
+            if language in WRITTEN and not {"install", "test"} & marks.keys():
+                for name in WRITTEN[language].findall(text):
+                    pages.setdefault(Path(name).stem, set()).add(page.name)
+    assert len(pages) > 15
+    assert {name: names for name, names in pages.items() if len(names) > 1} == {}
+
+
 def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
     source = tmp_path / "src"
