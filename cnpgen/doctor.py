@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cnpgen.threads import users_environment
+
 NEEDED = {  # module -> the project on PyPI that has it
     "numpy": "numpy",
     "scipy": "scipy",
@@ -72,7 +74,7 @@ class MachineReport:
         vector: The widest vector instructions: "avx512", "avx2", "avx", "neon", "sse2" or "unknown".
         libraries: Project -> version, "missing" or "broken".
         hdf5: Version of the HDF5 library.
-        environment: The variables that matter and are set.
+        environment: The variables that matter and that the user has set.
         compiler: The C compiler and its version, empty if there is none.
         backend: The kernels that would run, empty if none.
         backend_reason: Why.
@@ -119,6 +121,7 @@ def check_machine() -> MachineReport:
     found = _Findings()
     libraries = _check_libraries(found)
     cores, present = _check_cores(found)
+    theirs = users_environment()
     cache = _or(_cache_folder, "")
     backend, reason, writable = _check_backend(found, cache)
     return MachineReport(
@@ -131,7 +134,7 @@ def check_machine() -> MachineReport:
         vector=vector_instructions(),
         libraries=libraries,
         hdf5=_or(_hdf5_version, "unknown"),
-        environment={name: os.environ[name] for name in VARIABLES if os.environ.get(name)},
+        environment={name: theirs[name] for name in VARIABLES if theirs.get(name)},
         compiler=_or(_compiler, ""),
         backend=backend,
         backend_reason=reason,

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import json
+import os
 import re
 import sys
 import tomllib
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen import doctor
+from cnpgen import doctor, threads
 from cnpgen.doctor import check_machine, vector_instructions
 from cnpgen.kernels.compiled import find_compiler
 
@@ -163,3 +164,16 @@ def test_vector_instructions_are_read_from_cpuinfo(monkeypatch, flags, name):
 def test_arm_has_neon(monkeypatch):
     monkeypatch.setattr(doctor.platform, "machine", lambda: "arm64")
     assert vector_instructions() == "neon"
+
+
+def test_variables_that_nobody_set_are_not_reported(monkeypatch):
+    for name in threads.VARIABLES:
+        monkeypatch.setenv(name, "")  # so that it is put back afterwards, set or not
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("MKL_NUM_THREADS", "1")
+    monkeypatch.setattr(threads, "_preferred", {})
+    threads.prefer_one_thread()
+    assert all(os.environ[name] == "1" for name in threads.VARIABLES)
+    assert set(threads.VARIABLES) & check_machine().environment.keys() == {"MKL_NUM_THREADS"}
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    assert check_machine().environment["OMP_NUM_THREADS"] == "4"

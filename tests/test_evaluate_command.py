@@ -201,6 +201,7 @@ def test_the_first_plan_that_is_not_valid_is_drawn(run: Run, saved: Callable[[Pl
         (("--plot", "x.png", "--plan", "1"), "has no plan 1: 1 plans are numbered from 0"),
         (("--plot", "x.gif"), "ends in .png, .pdf or .svg"),
         (("--step", "0"), "expected a time above 0, such as 0.001 or 1ms; got '0'"),
+        (("--step", "5"), "the time step must be above 0 and at most 0.01 s, got 5 s"),
         (("--step", "1 Hz"), "expected a time above 0"),
         (("--step", "soon"), "expected a time above 0"),
         (("--workers", "0"), "at least 1"),

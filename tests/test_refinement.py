@@ -134,7 +134,9 @@ def test_plans_that_take_days_are_made_as_if_there_were_none(problems: Plans, so
     assert same(days.plans, few)
 
 
-def test_an_interrupted_run_goes_on_where_it_was(problems: Plans, solved: Plans, tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_where_it_was(
+    problems: Plans, solved: Plans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop(_plans: int, _valid: int) -> None:
         raise KeyboardInterrupt
 
@@ -144,8 +146,14 @@ def test_an_interrupted_run_goes_on_where_it_was(problems: Plans, solved: Plans,
     found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
     assert begun == [(N, 1)]
     assert same(found.plans, solved)
-    with pytest.raises(UsageError, match="another run"):
+    with pytest.raises(UsageError, match=r"another run \(options\.tolerance 0\.0005, now 0\.002\): --force"):
         refine_plans(problems, workers=1, journal=journal, options=RefineOptions(tolerance=2e-3))
+    with pytest.raises(UsageError, match=r"another run \(options\.weight None, now 2\.0, other plans\): --force"):
+        refine_plans(solved, workers=1, journal=journal, options=RefineOptions(weight=2.0))
+    with monkeypatch.context() as patch:
+        patch.setattr("cnpgen.refinement.__version__", "99.0")
+        with pytest.raises(UsageError, match=r"another run \(version .*, now 99\.0\): --force"):
+            refine_plans(problems, workers=1, journal=journal)
 
 
 def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:

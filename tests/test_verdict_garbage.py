@@ -96,7 +96,7 @@ def test_shapes_that_do_not_fit_are_a_usage_error(change):
         change(load("hit")).judged()
 
 
-@pytest.mark.parametrize("step", [0.0, -1e-3, np.nan, np.inf])
-def test_a_time_step_must_be_positive(step):
-    with pytest.raises(UsageError, match="time step"):
+@pytest.mark.parametrize("step", [0.0, -1e-3, np.nan, np.inf, 0.0101, 5.0])
+def test_a_time_step_must_be_positive_and_short_enough_to_mean_something(step):
+    with pytest.raises(UsageError, match=r"time step must be above 0 and at most 0\.01 s, got"):
         load("hit").judged(step=step)

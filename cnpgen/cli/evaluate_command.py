@@ -28,11 +28,22 @@ def add(commands: "Commands[Parser]") -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
     option("--problem", metavar="NAME|FILE", help="the problem that they must be for; its tolerances count")
-    option("--step", metavar="S", type=values.seconds, default=1e-3, help="time between two looks (default: 1ms)")
+    option(
+        "--step",
+        metavar="S",
+        type=values.seconds,
+        default=1e-3,
+        help="time between two looks (default: 1ms, at most 10ms)",
+    )
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="list the plans, too: a line each, those that are not valid first")
     option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan: .png, .pdf or .svg")
-    option("--plan", metavar="I", type=values.natural, help="the plan to draw; default the first that is not valid")
+    option(
+        "--plan",
+        metavar="I",
+        type=values.natural,
+        help="the plan to draw; default the first that is not valid, or plan 0 if all are",
+    )
     add_json(parser)
 
 

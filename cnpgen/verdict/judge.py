@@ -27,6 +27,7 @@ from cnpgen.verify.path import PathWorld
 
 Array = NDArray[np.float64]
 
+LONGEST_STEP = 0.01  # s: looks further apart miss most of what a robot does in between
 _GLANCE = np.linspace(0, 1, 33)  # phases at which most plans that are not valid show it
 
 
@@ -58,7 +59,7 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
         step: Time step [s].
 
     Raises:
-        UsageError: Shapes that do not fit together, or a step that is not positive.
+        UsageError: Shapes that do not fit together, or a step that is not positive or too long.
     """
     return Judge(problem, robot, step=step)(motion, boundary, start_xyz, goal_xyz)
 
@@ -72,7 +73,7 @@ class Judge:
         step: Time step [s].
 
     Raises:
-        UsageError: The step is not positive.
+        UsageError: The step is not positive, or above ``LONGEST_STEP``.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
@@ -115,8 +116,8 @@ def check_step(step: float) -> None:
     Raises:
         UsageError: It does not.
     """
-    if not 0 < step < np.inf:
-        raise UsageError(f"the time step must be positive, got {step:g} s")
+    if not 0 < step <= LONGEST_STEP:
+        raise UsageError(f"the time step must be above 0 and at most {LONGEST_STEP:g} s, got {step:g} s")
 
 
 @dataclass(frozen=True)
