@@ -1,6 +1,7 @@
 """What is installed: only cnpgen, with its recipes; complete public names; one version everywhere."""
 
 import ast
+import importlib
 import os
 import re
 import subprocess
@@ -109,3 +110,10 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert changelog is not None
     assert citation[1] == changelog[1] == cnpgen.__version__
     assert tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dynamic"] == ["version"]
+
+
+def test_the_bridge_to_tensorflow_says_what_to_install_where_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tensorflow", None)
+    monkeypatch.delitem(sys.modules, "cnpgen.interop.tensorflow", raising=False)
+    with pytest.raises(ImportError, match="tensorflow cannot be imported .*: pip install tensorflow"):
+        importlib.import_module("cnpgen.interop.tensorflow")

@@ -1,6 +1,7 @@
 """``cnpgen train`` and ``cnpgen plan``: what they write, print and refuse."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -61,6 +62,28 @@ def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monk
     monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]) == 0
     assert ("a planner from more rows is better" in capsys.readouterr().err) == (often == 0)
+
+
+def test_batches_of_more_rows_than_there_are_are_spoken_of(tiny, tmp_path, capsys):
+    words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]
+    said = re.compile(r"every step takes all ([\d,]+) rows: there are no 5,000 for a batch")
+    assert main([*words, "--batch-size", "5000", "--steps", "2"]) == 0
+    found = said.search(capsys.readouterr().err)
+    assert found
+    assert int(found[1]) == len(columns_of(tiny("airhockey-hit"), "train")["start_q"])
+    assert main([*words, "--steps", "2", "--force"]) == 0
+    assert "every step takes all" not in capsys.readouterr().err
+
+
+def test_the_checkpoint_of_another_run_is_a_wrong_argument(tiny, tmp_path, capsys, monkeypatch):
+    words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]
+    with monkeypatch.context() as patch:
+        patch.setattr("cnpgen.training.checkpoint.Checkpoints.remove", lambda self: None)
+        assert main(words) == 0
+    capsys.readouterr()
+    code, text = failing(capsys, [*words, "--seed", "3"])
+    assert code == 2
+    assert "is of another run, it differs in settings.seed (0, now 3)" in text
 
 
 def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):

@@ -198,7 +198,7 @@ def test_force_goes_on_with_its_own_checkpoint_and_throws_away_another_one(train
 def test_the_checkpoint_of_another_run_is_not_taken_for_this_one(train):
     with pytest.raises(CutOffError):
         train(watch=cut_at(5))
-    with pytest.raises(DatasetError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"):
+    with pytest.raises(UsageError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"):
         train(settings=replace(SMALL, learning_rate=2e-3))
     train(settings=replace(SMALL, learning_rate=2e-3), force=True)
 
@@ -289,7 +289,7 @@ def test_a_dataset_that_has_changed_since_is_not_trained_on_further(train, tmp_p
         train(watch=cut_at(5))
     other = tmp_path / "other"
     make_dataset(tiny_recipe("airhockey-hit", seed=7), other, workers=1)
-    with pytest.raises(DatasetError, match=r"another run.*dataset\.(seed|fingerprint)"):
+    with pytest.raises(UsageError, match=r"another run.*dataset\.(seed|fingerprint)"):
         train_model(other, tmp_path / "model.h5", steps=STEPS, settings=SMALL, check_rows=2)
 
 

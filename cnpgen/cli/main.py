@@ -62,7 +62,8 @@ examples:
 
 stdout is data, stderr everything else. Exit codes:
   0    done
-  1    the answer is no: a dataset or a file is damaged or unfinished, rows or plans are not valid
+  1    the answer is no: a dataset or a file is damaged, unfinished, of another kind or of another problem than what
+       it is used for; rows or plans are not valid
   2    a wrong argument, such as a path that is not there, or a mistake in a recipe
   3    the machine: no compiler, a full disk, a broken library; also an internal error of cnpgen
   130  interrupted (Ctrl-C); finished shards and plans are kept, the same command goes on

@@ -24,6 +24,9 @@ best of ten, compared on validation rows as 'cnpgen evaluate' judges them; its s
 printed on stdout. docs/training.md says how to choose.
 """
 
+_CHECK = "validation rows to compare models by, half of all at most (default: 200)"
+_SECONDS = "how long to train: CPU time of the steps; compiling and validations come on top (default: 2 min)"
+
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
@@ -33,7 +36,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="where the model goes, .h5")
     _add_length(parser)
     _add_how(parser)
-    option("--check", metavar="N", type=values.positive, default=200, help="rows to compare by (default: 200)")
+    option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
     option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
     option("--force", action="store_true", help="replace MODEL and the files beside it, another run's checkpoint too")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -41,7 +44,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def _add_length(parser: Parser) -> None:
     option = parser.add_mutually_exclusive_group().add_argument
-    option("--cpu-seconds", metavar="S", type=values.seconds, help="how long to train (default: 2 min)")
+    option("--cpu-seconds", metavar="S", type=values.seconds, help=_SECONDS)
     option("--steps", metavar="N", type=values.positive, help="likewise, in steps")
     option("--epochs", metavar="E", type=values.positive, help="likewise, in passes over all rows")
 
@@ -50,7 +53,7 @@ def _add_how(parser: Parser) -> None:
     option, metrics = parser.add_argument, ("ramped", "fixed", "learned", "bounded")
     option("--hidden", metavar="W", type=values.positive, help="width of the network's layers (default: 128)")
     option("--layers", metavar="L", type=values.positive, help="depth of its trunk (default: 5)")
-    option("--batch-size", metavar="B", type=values.positive, help="rows per step (default: 64)")
+    option("--batch-size", metavar="B", type=values.positive, help="rows per step, all if there are fewer (default: 64)")
     option("--learning-rate", metavar="X", type=float, help="largest learning rate of Adam (default: 1e-3)")
     option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
     option("--growth", metavar="X", type=float, help="by which factor ramped weights grow in the run (default: 30)")

@@ -31,7 +31,10 @@ class Watch:
         self._last = step
         parameters = run.learner.architecture.n_parameters
         self._meter.begin(f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step)
-        passes = steps * run.learner.settings.batch_size / len(run.rows)
+        wanted, taken = run.learner.settings.batch_size, run.order.batch_size
+        if taken < wanted and not self._quiet:
+            print(f"every step takes all {taken:,} rows: there are no {wanted:,} for a batch", file=sys.stderr)
+        passes = steps * taken / len(run.rows)
         if passes > OFTEN and not self._quiet:
             print(f"every row is seen {passes:,.0f} times: a planner from more rows is better", file=sys.stderr)
 

@@ -3,9 +3,12 @@
 from collections.abc import Iterator
 from typing import Any
 
-import tensorflow as tf
-
 from cnpgen.loader.batches import Batches
+
+try:
+    import tensorflow as tf
+except ImportError as error:
+    raise ImportError(f"tensorflow cannot be imported ({error}): pip install tensorflow") from error
 
 
 def to_tensorflow(batches: Batches) -> Any:

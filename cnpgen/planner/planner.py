@@ -75,6 +75,9 @@ class Planner:
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding, whatever the network gives.
 
+        Boundary conditions are not judged: of a start or goal outside of the limits or off the table comes a plan that
+        goes there, and ``evaluate_plans`` says that it is not valid.
+
         Args:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
             start_dq: Start velocities [rad/s]; at rest by default.

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.sealed import read_sealed, write_sealed
 from cnpgen.training.state import State, from_content, to_content
 
@@ -39,13 +39,14 @@ class Checkpoints:
             discard: Whether what is damaged or of another run is as if it were not there.
 
         Raises:
-            DatasetError: The file is damaged, or of another run.
+            DatasetError: The file is damaged.
+            UsageError: It is of another run.
         """
         if not self.path.exists():
             return None
         try:
             return self._load()
-        except DatasetError:
+        except (DatasetError, UsageError):
             if discard:
                 return None
             raise
@@ -58,7 +59,7 @@ class Checkpoints:
             raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
         changed = list(differences(found, self.identity))
         if changed:
-            raise DatasetError(
+            raise UsageError(
                 f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to go"
                 " on with it, or --force to throw it away"
             )

@@ -32,7 +32,7 @@ class TrainingSettings:
     Attributes:
         hidden: Width of the network's layers.
         layers: Depth of its trunk.
-        batch_size: Rows per step.
+        batch_size: Rows per step; all of them where there are fewer.
         learning_rate: Its peak.
         final_rate: The last learning rate, as a fraction of the peak.
         warm_up: Steps until the peak.

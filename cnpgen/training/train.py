@@ -70,7 +70,7 @@ def train_model(
         steps: How long, in steps.
         epochs: How long, in passes over all rows.
         cpu_seconds: How long, in CPU time of the steps [s]: how long a step takes is measured before, and their number
-            is then fixed. If nothing says how long, 120 s.
+            is then fixed. Compiling, reading rows and validating come on top. If nothing says how long, 120 s.
         settings: How to train.
         check_rows: Validation rows that models are compared by on the way, half of them at most; the best one is judged
             on up to 2,000 others.
@@ -81,8 +81,9 @@ def train_model(
         watch: Called with every line of the log.
 
     Raises:
-        UsageError: An argument cannot be meant, or there is another model, or a log or picture of something else.
-        DatasetError: The dataset or the checkpoint is damaged, or the checkpoint is of another run.
+        UsageError: An argument cannot be meant, or there is another model, another run's checkpoint, or a log or
+            picture of something else.
+        DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """
     lasts = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
