@@ -105,7 +105,7 @@ def test_compiling_is_announced_once_and_only_where_it_happens(tmp_path, capsys)
     with notices():
         library.load(doubling)
         library.load(tripling)
-    assert capsys.readouterr().err == "cnpgen: compiling kernels, once per machine\n"
+    assert capsys.readouterr().err == "cnpgen: compiling kernels, once per problem and machine\n"
     with notices():
         library.load(doubling)
     assert capsys.readouterr().err == ""

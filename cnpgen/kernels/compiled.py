@@ -202,7 +202,7 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     compiler = require_compiler()
     libraries, stem = cache_folder / "lib", library_stem(tape, compiler)
     try:
-        _LOG.info("compiling kernels, once per machine")
+        _LOG.info("compiling kernels, once per problem and machine")
         libraries.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
             source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"
