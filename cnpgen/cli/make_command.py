@@ -62,8 +62,10 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from cnpgen.cli.recipe_names import check_recipe
     from cnpgen.library import load_dataset_recipe
 
+    check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' goes on with it")
     recipe = load_dataset_recipe(arguments.recipe)
     if arguments.certify:
         from cnpgen.certification import certified

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import RecipeError, UsageError, nearest
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             render(plain(describe.kind_to_dict(group, name))) if arguments.json else describe.describe_kind(group, name)
         )
         return 0
+    check_recipe(arguments.recipe)
     recipe = load_any(arguments.recipe, arguments.kind)
     print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
     return 0

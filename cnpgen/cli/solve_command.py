@@ -47,6 +47,7 @@ def _name(what: Path) -> str:
 
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
+    from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.errors import UsageError
     from cnpgen.solving import draw_problems, load_problems
 
@@ -58,8 +59,10 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
         return load_problems(
             arguments.what, split=arguments.split or "validation", start=arguments.first or 0, n=arguments.n
         )
+    check_there(arguments.what)
+    check_recipe(arguments.what)
     if arguments.split is not None or arguments.first is not None:
         raise UsageError("--split and --first are for the folder of a dataset; fresh draws of a recipe have --seed")
     if arguments.n is None:
-        raise UsageError(f"{arguments.what} is no folder; of a recipe, --n says how many fresh problems are drawn")
+        raise UsageError(f"--n says how many fresh problems of the recipe {arguments.what} are drawn: it is missing")
     return draw_problems(arguments.what, arguments.n, seed=arguments.seed)
