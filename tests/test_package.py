@@ -115,5 +115,5 @@ def test_the_version_is_the_same_everywhere() -> None:
 def test_the_bridge_to_tensorflow_says_what_to_install_where_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tensorflow", None)
     monkeypatch.delitem(sys.modules, "cnpgen.interop.tensorflow", raising=False)
-    with pytest.raises(ImportError, match="tensorflow cannot be imported .*: pip install tensorflow"):
+    with pytest.raises(ImportError, match=r"tensorflow cannot be imported .*: pip install tensorflow"):
         importlib.import_module("cnpgen.interop.tensorflow")

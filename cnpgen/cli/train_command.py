@@ -53,7 +53,7 @@ def _add_how(parser: Parser) -> None:
     option, metrics = parser.add_argument, ("ramped", "fixed", "learned", "bounded")
     option("--hidden", metavar="W", type=values.positive, help="width of the network's layers (default: 128)")
     option("--layers", metavar="L", type=values.positive, help="depth of its trunk (default: 5)")
-    option("--batch-size", metavar="B", type=values.positive, help="rows per step, all if there are fewer (default: 64)")
+    option("--batch-size", metavar="B", type=values.positive, help="rows per step, or all there are (default: 64)")
     option("--learning-rate", metavar="X", type=float, help="largest learning rate of Adam (default: 1e-3)")
     option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
     option("--growth", metavar="X", type=float, help="by which factor ramped weights grow in the run (default: 30)")
