@@ -150,7 +150,7 @@ def test_ten_lines_of_any_trainer_write_a_valid_file(tmp_path: Path) -> None:
     assert "cnpgen" not in block
     assert sum(bool(line.strip()) for line in block.splitlines()) <= 10
     subprocess.run([sys.executable, "-c", block], cwd=tmp_path, check=True)
-    plans = load_plans(tmp_path / "plans.h5", problem="airhockey")
+    plans = load_plans(tmp_path / "written.h5", problem="airhockey")
     assert len(plans) == 8
     assert plans.sample_id.tolist() == list(range(8))
     assert not plans.status.any()
