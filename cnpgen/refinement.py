@@ -27,7 +27,7 @@ from cnpgen.workers import share_out, worker_count
 FORMAT = "cnpgen-refinement"
 FORMAT_VERSION = 1
 ALONE = 60  # plans up to which a second process is not worth its start
-PART = 1  # plans that a process refines before it is given others: what is finished is written down at once
+PART = 4  # plans that one of several processes refines at a time: handing over takes as long as a twentieth of a plan
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
@@ -128,8 +128,9 @@ def _run(
 ) -> Iterator[dict[int, Refined]]:
     if not waiting:
         return
-    parts = [waiting[first : first + PART] for first in range(0, len(waiting), PART)]
-    count = worker_count(1 if workers is None and len(waiting) <= ALONE else workers, len(parts))
+    count = worker_count(1 if workers is None and len(waiting) <= ALONE else workers, -(-len(waiting) // PART))
+    size = 1 if count == 1 else PART
+    parts = [waiting[first : first + size] for first in range(0, len(waiting), size)]
     prepare(plans, options)  # kernels are compiled once, not by every worker
     tasks = ((part, plans.select(np.array(part))) for part in parts)
     advice = "" if journal is None else f": {journal.path} holds what is finished; run the same command again to go on"
