@@ -10,7 +10,7 @@ they have and to that of another problem; "T / left" is the mean time of the new
 """
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000, "heav
 GRID = "airhockey-hit"
 SHORT = {"planned": 500, "refined": 40}
 REPLANNER, WHEN = "airhockey-replan", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)  # parts of T
+STEPS, CURVED = (1, 2, 3, 4, 6, 10), 100  # steps of the refiner's first pass; plans
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,21 @@ def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, A
     return found
 
 
+def curve(name: str, seed: int, count: int) -> dict[int, float]:
+    """Refine with few steps: mean motion time over that with as many as it takes, where both are valid."""
+    plans = Planner(name).plan_batch(draw_problems(name, count, seed=seed).boundary)
+    found = {}
+    with one_thread():
+        full = make_each(plans, DEFAULT)
+        for steps in STEPS:
+            progress(f"{name}: {count} plans, at most {steps} steps")
+            made = make_each(plans, replace(DEFAULT, max_iterations=steps))
+            both = [(a.duration, b.duration) for a, b in zip(made, full, strict=True) if a.valid and b.valid]
+            few, all_ = np.array(both).T
+            found[steps] = float(np.mean(few / all_))
+    return found
+
+
 def replan_table(found: list[dict[str, Any]]) -> str:
     """Lay out what ``replan`` found."""
     rows = [
@@ -159,11 +175,15 @@ def main() -> None:
     rows = [row for name, values in found.items() for row in rows_of(name, values)]
     head = ("planner", "figure", "value", "target", "", "of target")
     tables = [table("shipped planners on fresh problems", head, rows, left=2)]
+    curves = {name: curve(name, chosen.seed, CURVED if chosen.full else SHORT["refined"]) for name in chosen.models}
+    lines = [(name, *(f"{value:.4f}" for value in values.values())) for name, values in curves.items()]
+    steps = [f"{step} step{'s' if step > 1 else ''}" for step in STEPS]
+    tables.append(table("motion time over that after as many steps as it takes", ("planner", *steps), lines))
     again = []
     if REPLANNER in chosen.models:
         again = replan(REPLANNER, chosen.seed, SHORT["planned"], SHORT["refined"])
         tables.append(replan_table(again))
-    report({"planners": found, "replanned": again}, tables, as_json=chosen.json)
+    report({"planners": found, "curves": curves, "replanned": again}, tables, as_json=chosen.json)
 
 
 if __name__ == "__main__":
