@@ -9,6 +9,7 @@ from example_losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
 from example_plans import PROBLEMS
 
 from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.losses.value import LossValue
 from cnpgen.schema import Range
 
 CASES = [(label, term, "signed") for label in ("hit", "transport") for term in loss(PROBLEM_OF[label]).terms]
@@ -38,18 +39,25 @@ def along(given: Batch, of: PlanLoss, direction: tuple[np.ndarray, np.ndarray], 
     return np.asarray((ends[0] - ends[1]) / 2e-6)
 
 
-@pytest.mark.parametrize(("label", "term", "form"), CASES)
-def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_differences(label, term, form):
-    of, given, random = loss(PROBLEM_OF[label], form=form), far(label), np.random.default_rng(3)
-    options = {"weights": weights_of(of, term)}
-    value = given.evaluated(of, **options)
-    assert (value.terms[:, of.terms.index(term)] > 0).any()
+def check_along_random_directions(
+    given: Batch, of: PlanLoss, value: LossValue, random: np.random.Generator, **options: Any
+) -> None:
+    """Compare the gradients of a value with central differences of the totals."""
     for _ in range(3):
         direction = random.normal(size=given.path.shape), random.normal(size=given.rate.shape)
         expected = along(given, of, direction, **options)
         found = np.einsum("kcn,kcn->k", value.path_gradient, direction[0])
         found += np.einsum("kr,kr->k", value.rate_gradient, direction[1])
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("label", "term", "form"), CASES)
+def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_differences(label, term, form):
+    of, given, random = loss(PROBLEM_OF[label], form=form), far(label), np.random.default_rng(3)
+    options = {"weights": weights_of(of, term)}
+    value = given.evaluated(of, **options)
+    assert (value.terms[:, of.terms.index(term)] > 0).any()
+    check_along_random_directions(given, of, value, random, **options)
 
 
 @pytest.mark.parametrize("start", [0.163, 0.19], ids=["in the band", "beyond it"])
@@ -59,12 +67,7 @@ def test_the_gradient_of_a_motion_that_starts_off_the_table_is_that_of_central_d
     value, closed = given.evaluated(of, **options), given.evaluated(of, weights=options["weights"])
     assert (value.terms[:, -1] < closed.terms[:, -1]).all()
     assert np.abs(value.path_gradient - closed.path_gradient).max() > 0.1
-    for _ in range(3):
-        direction = random.normal(size=given.path.shape), random.normal(size=given.rate.shape)
-        expected = along(given, of, direction, **options)
-        found = np.einsum("kcn,kcn->k", value.path_gradient, direction[0])
-        found += np.einsum("kr,kr->k", value.rate_gradient, direction[1])
-        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+    check_along_random_directions(given, of, value, random, **options)
 
 
 @pytest.mark.parametrize("label", ["hit", "transport"])
