@@ -22,9 +22,10 @@ LISTED = 10  # plans without success that are listed
 
 TEXT = """\
 Every plan is handled for itself: --workers and the order of the plans change nothing but the time. Pinocchio and Coal
-decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once: after Ctrl-C, kill -9
-or a full disk the same command goes on. An existing OUT is replaced only with --force, and only if it is a file of
-plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written in either case.
+decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once, by several workers in
+fours: after Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
+and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
+in either case.
 docs/refiner.md has the formulation.
 """
 
