@@ -1,5 +1,6 @@
 """Bounds of the residuals on a grid: the problem's, tightened between the points where nothing else looks."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -84,7 +85,7 @@ class BoundsTemplate:
         self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
-        self._pairs = pairs
+        self._funnels = list(_funnels(pairs))
         self._allowed = np.concatenate([each.allowed(condition) / _scale(each, condition) for each, condition in pairs])
         needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in pairs])
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
@@ -114,17 +115,24 @@ class BoundsTemplate:
 
     def _of(self, start_tip: Array) -> Bounds:
         lower, upper = self._lower, self._upper
-        column = 0
-        for constraint, condition in self._pairs:
-            width = len(condition.g)
+        for constraint, condition, columns in self._funnels:
             wider = constraint.funnel(condition, self._funnelled, start_tip)
             if np.any(wider > 0):
                 scale = _scale(constraint, condition)
                 lower, upper = lower.copy("F"), upper.copy("F")
-                lower[:, column : column + width] -= wider[:, None] / scale
-                upper[:, column : column + width] += wider[:, None] / scale
-            column += width
+                lower[:, columns] -= wider[:, None] / scale
+                upper[:, columns] += wider[:, None] / scale
         return Bounds(lower, upper, self._sharp)
+
+
+def _funnels(pairs: list[tuple[Constraint, Condition]]) -> Iterator[tuple[Constraint, Condition, slice]]:
+    """Yield the conditions of constraints that motions may begin outside of, with their columns."""
+    column = 0
+    for constraint, condition in pairs:
+        width = len(condition.g)
+        if type(constraint).funnel is not Constraint.funnel:
+            yield constraint, condition, slice(column, column + width)
+        column += width
 
 
 def _scale(constraint: Constraint, condition: Condition) -> Array:

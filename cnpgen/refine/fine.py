@@ -11,7 +11,7 @@ from cnpgen.refine.bounds import BoundsTemplate, Tightening
 from cnpgen.refine.grid import make_grid
 from cnpgen.refine.stage import residual_scale
 from cnpgen.refine.task import Task
-from cnpgen.refine.transcription import Stage, Transcription
+from cnpgen.refine.transcription import Stage, Transcription, of_last
 
 if TYPE_CHECKING:
     from cnpgen.verify.world import World
@@ -50,8 +50,8 @@ class FineCheck:
     """
 
     def __init__(self, problem: Problem, world: "World", stage: Stage) -> None:
-        self._stage = stage
         self._grid = make_grid(stage.spec, POINTS)
+        self._last = of_last(lambda task: Transcription(stage, self._grid, boundary=task.boundary, tops=task.tops))
         none = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
         self._bounds = BoundsTemplate(problem, world, self._grid.s, none)
         conditions = [(each, condition) for each in problem.constraint for condition in each.measured(world)]
@@ -65,8 +65,8 @@ class FineCheck:
         self._needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in conditions])
 
     def transcription(self, task: Task) -> Transcription:
-        """Return the motion on the fine grid."""
-        return Transcription(self._stage, self._grid, boundary=task.boundary, tops=task.tops)
+        """Return the motion on the fine grid; for one task it is asked for many times."""
+        return self._last(task)
 
     def measure(self, task: Task, x: Array) -> tuple[float, Excess]:
         """Return the objective and the excess of a motion."""

@@ -1,18 +1,21 @@
 """The quadratic programme of one step: which residuals it holds, and its solution by DAQP."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 INFINITE = 1e30  # what DAQP takes for no bound
-ELASTIC = 1e-2  # curvature of the elastic variable's cost; far smaller ones triple the working-set changes
+SOFTNESS = 0.1  # root of the curvature of the elastic variable's cost; far smaller ones triple the working-set changes
 USED = 1e-3  # its slope where nothing is violated
 MULTIPLIER = 1e-9  # smaller ones belong to residuals that are not active
 FEASIBLE = 1e-6  # of DAQP
@@ -70,16 +73,18 @@ class Model:
         """
         import daqp
 
+        nx, unwhiten = self.motion.nx, self._unwhiten
+        if unwhiten is None:
+            return None
         k, which = np.nonzero(held)
-        rows, low, high = self._rows(k, which, relax=relax)
-        sense = np.zeros(self.motion.nx + 1 + len(k), np.int32)
+        rows, low, high = self._rows(k, which, unwhiten, relax=relax)
+        sense = np.zeros(nx + 1 + len(k), np.int32)
         if warm is not None:
             before = warm[k, which]
-            sense[self.motion.nx + 1 :] = np.select([before > MULTIPLIER, before < -MULTIPLIER], [UPPER, LOWER], 0)
-        hessian, linear = self._objective()
+            sense[nx + 1 :] = UPPER * (before > MULTIPLIER) + LOWER * (before < -MULTIPLIER)
         solution, _, flag, info = daqp.solve(
-            hessian,
-            linear,
+            np.eye(nx + 1),
+            np.append(self.at.gradient @ unwhiten, (self.penalty * self.violation + USED) / SOFTNESS),
             rows,
             np.concatenate([box, [1.0], np.minimum(high, INFINITE)]),
             np.concatenate([-box, [0.0], np.maximum(low, -INFINITE)]),
@@ -90,29 +95,33 @@ class Model:
         if flag < 1 or not np.isfinite(solution).all():
             return None
         multipliers = np.zeros(self.at.g.shape)
-        multipliers[k, which] = info["lam"][self.motion.nx + 1 :]
-        return Step(solution[:-1], float(solution[-1]), multipliers)
+        multipliers[k, which] = info["lam"][nx + 1 :]
+        return Step(unwhiten @ solution[:-1], float(solution[-1]) / SOFTNESS, multipliers)
 
-    def _objective(self) -> tuple[Array, Array]:
-        """Hessian and slope in the variables and the elastic one."""
-        nx = self.motion.nx
-        hessian = np.zeros((nx + 1, nx + 1))
-        hessian[:nx, :nx] = self.at.curvature
-        hessian[range(nx), range(nx)] += self.proximal
-        hessian[nx, nx] = ELASTIC
-        return hessian, np.append(self.at.gradient, self.penalty * self.violation + USED)
+    @cached_property
+    def _unwhiten(self) -> Array | None:
+        """What turns variables in which the Hessian is 1 into steps, shape (nx, nx); None where it is not positive."""
+        hessian = self.at.curvature.copy()
+        hessian.flat[:: len(hessian) + 1] += self.proximal
+        factor, failed = dpotrf(hessian, lower=True)
+        inverse, _ = dtrtri(factor, lower=True)
+        return None if failed else np.asarray(inverse.T)
 
-    def _rows(self, k: NDArray[np.intp], which: NDArray[np.intp], *, relax: bool) -> tuple[Array, Array, Array]:
-        """Gradients of held residuals, shape (m, nx + 1), and how far they may fall and rise."""
+    def _rows(self, k: Indices, which: Indices, unwhiten: Array, *, relax: bool) -> tuple[Array, Array, Array]:
+        """Gradients of the box, the elastic variable and held residuals, and how far residuals may fall and rise."""
         g, lower, upper = self.at.g[k, which], self.bounds.lower[k, which], self.bounds.upper[k, which]
-        rows = np.empty((len(k), self.motion.nx + 1))
-        rows[:, :-1] = self.motion.rows(self.at, k, which)
+        nx = self.motion.nx
+        rows = np.zeros((nx + 1 + len(k), nx + 1))
+        rows[:nx, :-1] = unwhiten
+        np.matmul(self.motion.rows(self.at, k, which), unwhiten, out=rows[nx + 1 :, :-1])
+        rows[nx, -1] = 1 / SOFTNESS
+        elastic = rows[nx + 1 :, -1]
         if relax:
             nearer = upper - g < g - lower
-            rows[:, -1] = np.where(nearer, -self.violation, self.violation)
+            elastic[:] = np.where(nearer, -self.violation, self.violation) / SOFTNESS
             return rows, np.where(nearer, -INFINITE, lower - g), np.where(nearer, upper - g, INFINITE)
         above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
-        rows[:, -1] = below - above
+        elastic[:] = (below - above) / SOFTNESS
         return rows, np.where(above > 0, -INFINITE, lower - g), np.where(below > 0, INFINITE, upper - g)
 
 

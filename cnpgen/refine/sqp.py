@@ -56,7 +56,7 @@ class Settings:
     penalty: float = 2.0
     funnel: float = 0.3
     far: float = np.inf
-    cost_tolerance: float = 5e-4
+    cost_tolerance: float = 1e-3
     violation_tolerance: float = 6e-4
     thin: int = 6
 

@@ -8,6 +8,7 @@ violation of 1e-3 means about the same everywhere.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -87,10 +88,10 @@ class Transcription:
         self.nx = self.split + spec.rate_control_points
         self.tops = tops
         self._tops = np.repeat(tops[:, None], len(grid.s), axis=1)
-        second = np.diff(np.eye(spec.rate_control_points), 2, axis=0)
-        self._smooth = 2 * SMOOTH_RATE * second.T @ second
-        self._at = _of_last(self._states)  # steps that are taken are evaluated again, with derivatives
-        self._residuals = _of_last(self._criterion_residuals)
+        self._smooth = _smoothing(spec.rate_control_points)
+        self._at = of_last(self._states)  # steps that are taken are evaluated again, with derivatives
+        self._residuals = of_last(self._criterion_residuals)
+        self._slopes = of_last(lambda rate: boundary_slopes(boundary, rate[None], spec))
 
     def unpack(self, x: Array) -> tuple[Array, Array]:
         """Return path control points (C, n) and rate control points (R,) of the variables."""
@@ -217,19 +218,28 @@ class Transcription:
         end = self.spec.path_control_points - self.boundary.fixed_at_goal
         out[:, : self.split] = control[:, 3:end].reshape(m, self.split)
         out[:, self.split :] = (bases.rate_at[k] @ stage[:, orders * n :, None])[..., 0] * rate
-        for each in boundary_slopes(self.boundary, rate[None], self.spec):
+        for each in self._slopes(rate):
             out[:, self.split + each.variable] += control[:, each.point] @ (each.slope[0] * rate[each.variable])
         return out
 
 
-def _of_last(function: Callable[..., T]) -> Callable[..., T]:
-    """Keep what a function returned for the arrays that it was last given."""
-    last: list[Any] = [(), None]
+@cache
+def _smoothing(points: int) -> Array:
+    """Hessian of what fixes the gauge, shape (R, R)."""
+    second = np.diff(np.eye(points), 2, axis=0)
+    return np.asarray(2 * SMOOTH_RATE * second.T @ second)
 
-    def recall(*arrays: Array) -> T:
-        if len(last[0]) != len(arrays) or any(a is not b for a, b in zip(last[0], arrays, strict=True)):
-            last[:] = arrays, function(*arrays)
-        result: T = last[1]
+
+def of_last(function: Callable[..., T]) -> Callable[..., T]:
+    """Keep what a function returned for the objects that it was last given; threads may share it."""
+    last: list[tuple[tuple[Any, ...], T]] = []
+
+    def recall(*objects: Any) -> T:
+        for known, result in last:
+            if len(known) == len(objects) and all(a is b for a, b in zip(known, objects, strict=True)):
+                return result
+        result = function(*objects)
+        last[:] = [(objects, result)]
         return result
 
     return recall

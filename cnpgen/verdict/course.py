@@ -1,6 +1,7 @@
 """One motion at many phases: joint positions and their derivatives in time, joint by joint."""
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,11 @@ class Course:
         q: Joint positions [rad].
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
-        jerk: Joint jerks [rad/s^3].
     """
 
     q: Array
     dq: Array
     ddq: Array
-    jerk: Array
 
 
 def course(motion: Motion, s: Array) -> Course:
@@ -37,37 +36,38 @@ def course(motion: Motion, s: Array) -> Course:
         motion: One motion.
         s: Phases in [0, 1], shape (K,).
     """
-    p, p1, p2, p3 = _derivatives(motion.path[0], motion.degree, s)
-    r, r1, r2, _ = _derivatives(motion.rate[0, :, None], motion.degree, s)
-    return Course(
-        q=p,
-        dq=p1 * r,
-        ddq=(p2 * r + p1 * r1) * r,
-        jerk=((p3 * r + 3 * p2 * r1) * r + p1 * (r2 * r + r1**2)) * r,
-    )
+    p, p1, p2 = _derivatives(motion.path[0], motion.degree, s, orders=3)
+    r, r1 = _derivatives(motion.rate[0, :, None], motion.degree, s, orders=2)
+    return Course(q=p, dq=p1 * r, ddq=(p2 * r + p1 * r1) * r)
 
 
-def _derivatives(control: Array, degree: int, s: Array) -> tuple[Array, Array, Array, Array]:
-    """Evaluate a spline and its first three derivatives by Horner's rule.
+def jerks(motion: Motion, s: Array) -> Array:
+    """Evaluate the joint jerks of one motion at phases s [rad/s^3], shape (n, K)."""
+    _, p1, p2, p3 = _derivatives(motion.path[0], motion.degree, s, orders=4)
+    r, r1, r2 = _derivatives(motion.rate[0, :, None], motion.degree, s, orders=3)
+    return np.asarray(((p3 * r + 3 * p2 * r1) * r + p1 * (r2 * r + r1**2)) * r)
+
+
+def _derivatives(control: Array, degree: int, s: Array, *, orders: int) -> list[Array]:
+    """Evaluate a spline and its first derivatives by Horner's rule.
 
     Args:
         control: Control points, shape (C, n).
         degree: Its degree D, at least 3.
         s: Phases in [0, 1], shape (K,).
+        orders: How many: 1 is the spline alone.
 
     Returns:
-        Four arrays of shape (n, K).
+        Arrays of shape (n, K).
     """
     spans = len(control) - degree
     span = np.clip(s * spans, 0, spans - 1).astype(np.intp)
     offset = s - span / spans
     powers = np.tensordot(taylor(len(control), degree), control, axes=1)  # (D + 1, spans, n)
     coefficients = np.ascontiguousarray(powers.transpose(0, 2, 1)).take(span, axis=2)
-    value = coefficients[-1]
-    first, second, third = (np.zeros_like(value) for _ in range(3))
+    found = [coefficients[-1], *(np.zeros_like(coefficients[-1]) for _ in range(orders - 1))]
     for coefficient in coefficients[-2::-1]:
-        third = third * offset + second
-        second = second * offset + first
-        first = first * offset + value
-        value = value * offset + coefficient
-    return value, first, 2 * second, 6 * third
+        for order in range(orders - 1, 0, -1):
+            found[order] = found[order] * offset + found[order - 1]
+        found[0] = found[0] * offset + coefficient
+    return [factorial(order) * each for order, each in enumerate(found)]

@@ -18,7 +18,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict.closer import keep_worse, look_closer
-from cnpgen.verdict.course import course
+from cnpgen.verdict.course import course, jerks
 from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
 from cnpgen.verdict.sampling import Samples, sample, time_table
@@ -175,7 +175,7 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     ]
     metrics, paper = Metrics(), PaperRule()
     if not brief:
-        metrics = _metrics(plan.problem, world, samples, states.jerk)
+        metrics = _metrics(plan, world, samples)
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
     margins = keep_worse(margins, look_closer(plan.problem, world, plan.motion, samples, plan.tops))
     return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
@@ -189,10 +189,10 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     states = course(plan.motion, samples.s)
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return True
-    if not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names)):
-        return True
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
-    return not all(margin.ok for margin in constraint_margins(plan.problem, world, samples))
+    if not all(margin.ok for margin in constraint_margins(plan.problem, world, samples)):
+        return True
+    return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
 
 
 def _samples(plan: _Plan, step: float) -> Samples | Verdict:
@@ -217,8 +217,9 @@ def _reason(margins: list[Margin]) -> str:
     return max(broken, key=lambda margin: margin.severity).reason
 
 
-def _metrics(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) -> Metrics:
-    robot = world.robot
+def _metrics(plan: _Plan, world: PathWorld, samples: Samples) -> Metrics:
+    problem, robot = plan.problem, world.robot
+    jerk = jerks(plan.motion, samples.s)
     share = world.torque / robot.torque_limit[:, None]
     table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
     upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)

@@ -1,5 +1,6 @@
 """How near one motion comes to every bound: of its boundary conditions and of the problem's constraints."""
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -63,8 +64,8 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joint
     return margins
 
 
-def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> list[Margin]:
-    """Measure every constraint along a motion.
+def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> Iterator[Margin]:
+    """Measure every constraint along a motion, one by one.
 
     Args:
         problem: The problem.
@@ -72,12 +73,10 @@ def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> 
         samples: When and at which phase they are.
     """
     start_tip = world.tip_position[:, 0]
-    return [
-        measure_condition(problem, constraint, condition, samples, start_tip=start_tip)
-        for constraint in problem.constraint
-        for condition in constraint.measured(cast("World", world))  # the same questions, answered for K states
-        if condition.g
-    ]
+    for constraint in problem.constraint:
+        for condition in constraint.measured(cast("World", world)):  # the same questions, answered for K states
+            if condition.g:
+                yield measure_condition(problem, constraint, condition, samples, start_tip=start_tip)
 
 
 def measure_condition(
