@@ -63,8 +63,8 @@ def _derivatives(control: Array, degree: int, s: Array, *, orders: int) -> list[
     spans = len(control) - degree
     span = np.clip(s * spans, 0, spans - 1).astype(np.intp)
     offset = s - span / spans
-    powers = np.tensordot(taylor(len(control), degree), control, axes=1)  # (D + 1, spans, n)
-    coefficients = np.ascontiguousarray(powers.transpose(0, 2, 1)).take(span, axis=2)
+    powers = control.T @ taylor(len(control), degree).transpose(0, 2, 1)  # (D + 1, n, spans)
+    coefficients = powers.take(span, axis=2)
     found = [coefficients[-1], *(np.zeros_like(coefficients[-1]) for _ in range(orders - 1))]
     for coefficient in coefficients[-2::-1]:
         for order in range(orders - 1, 0, -1):
