@@ -16,6 +16,7 @@ from cnpgen.refine.grid import make_grid
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
+from cnpgen.refine.refiner import Pass
 from cnpgen.refine.sqp import Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Outcome, Refined
@@ -331,3 +332,23 @@ def test_a_first_pass_that_ends_within_its_bounds_is_offered_at_once_and_measure
     assert second.outcome is Outcome.POLISHED
     assert 0 < second.excess <= 1
     assert excess.worst < 3
+
+
+def test_a_valid_plan_that_is_off_the_table_by_more_than_a_tenth_of_the_tolerance_is_polished_once() -> None:
+    plan = load("hit")
+    usual = refiner("airhockey").passes
+    wide = replace(usual.first, tightening=replace(usual.first.tightening, band=0.4))
+    jury = Jury(plan.problem, plan.robot, degree=7)
+
+    def outcome_and_height(**passes: Pass) -> tuple[Outcome, float]:
+        found = refine_task(refiner_of(plan.problem, passes=replace(usual, **passes)), jury, task(plan))
+        seen = verdict(plan, plan.boundary, found.path, found.rate)
+        assert seen.valid
+        return found.outcome, seen.margins["table height"].excess
+
+    outcome, off = outcome_and_height(first=wide)
+    assert outcome == Outcome.POLISHED
+    assert off <= 1e-4
+    outcome, off = outcome_and_height(first=wide, polish=replace(wide, points=256))
+    assert outcome in {Outcome.SOLVED, Outcome.POLISHED}
+    assert 1e-4 < off <= 1e-3

@@ -47,6 +47,9 @@ class FineCheck:
         problem: The problem.
         world: Any world of it.
         stage: The kernels.
+
+    Attributes:
+        equalities: Names of the conditions that allow one value only.
     """
 
     def __init__(self, problem: Problem, world: "World", stage: Stage) -> None:
@@ -62,6 +65,7 @@ class FineCheck:
                 for each, condition in conditions
             ]
         )
+        self.equalities = {each.name for _, each in conditions if np.array_equal(each.lower, each.upper)}
         self._needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in conditions])
 
     def transcription(self, task: Task) -> Transcription:
@@ -84,10 +88,14 @@ class FineCheck:
         speed, strength = (size[self._needs == needs].max(initial=1.0) for needs in (1, 2))
         return cost, Excess(worst, bool(high[:, self._needs == 0].any()), max(speed, float(np.sqrt(strength))))
 
+    def excess_of_ends(self, task: Task) -> float:
+        """By how much the boundary conditions alone exceed a bound, as a multiple of what is allowed."""
+        bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)
+        return float(np.nanmax(bounds.beyond(motion.end_residuals()) / np.maximum(self._allowed, ROUNDING)))
+
     def refutes_ends(self, task: Task) -> bool:
         """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
-        bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)
-        return bool(np.nanmax(bounds.beyond(motion.end_residuals()) / np.maximum(self._allowed, ROUNDING)) > CERTAIN)
+        return self.excess_of_ends(task) > CERTAIN
 
     def slow_down(
         self, task: Task, motion: Transcription, x: Array, *, at_any_cost: bool = False

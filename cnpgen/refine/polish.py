@@ -13,6 +13,7 @@ from cnpgen.verdict.verdict import Reason, Verdict
 
 Array = NDArray[np.float64]
 
+PRECISE = 0.1  # of an equality's tolerance, beyond what the ends need: the optimiser's band is narrower
 HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless there is no better one
 
 
@@ -23,10 +24,12 @@ class _Candidate:
     Attributes:
         refined: The plan.
         severity: 1 if it is valid; else how wrong it is, inf if it could not be evaluated.
+        precise: Whether equalities are met much better than they must be.
     """
 
     refined: Refined
     severity: float
+    precise: bool
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -55,19 +58,20 @@ class _Search:
     hopeless: list[Attempt] = field(default_factory=list)
 
     def offer(self, attempt: Attempt) -> bool:
-        """Take an attempt in; return whether it is valid."""
+        """Take an attempt in; return whether that will do: one is valid and precise, or just valid since before."""
         self.iterations += attempt.iterations
+        enough = any(each.refined.valid for each in self.judged)
         if attempt.excess > HOPELESS:
             self.hopeless.append(attempt)
-            return False
+            return enough
         self.judged.append(self._candidate(attempt))
-        return self.judged[-1].refined.valid
+        return enough or (self.judged[-1].refined.valid and self.judged[-1].precise)
 
     def best(self) -> _Candidate:
         """Return the best attempt."""
         if not self.judged:
             self.judged.append(self._candidate(min(self.hopeless, key=lambda each: (each.excess, each.cost))))
-        return min(self.judged, key=lambda each: each.rank)
+        return min(self.judged, key=lambda each: (each.severity, not each.precise, each.refined.cost))
 
     def may_be_better(self, path: Array, rate: Array, best: Refined) -> bool:
         """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted."""
@@ -81,7 +85,13 @@ class _Search:
         verdict = self.jury.verdict(self.task, path, rate)
         cost = self.refiner.check.transcription(self.task).objective(path, rate)
         reached = outcome if verdict.valid or outcome is Outcome.KEPT else Outcome.UNSOLVED
-        return _Candidate(Refined(path, rate, reached, verdict.reason, 0, cost), _severity(verdict))
+        refined = Refined(path, rate, reached, verdict.reason, 0, cost)
+        return _Candidate(refined, _severity(verdict), self._is_precise(verdict))
+
+    def _is_precise(self, verdict: Verdict) -> bool:
+        check = self.refiner.check
+        worst = max((each.severity for each in verdict.margins.values() if each.name in check.equalities), default=0.0)
+        return worst <= PRECISE or worst <= PRECISE + check.excess_of_ends(self.task)
 
     def _candidate(self, attempt: Attempt) -> _Candidate:
         path, rate = self.refiner.check.transcription(self.task).unpack(attempt.x)
