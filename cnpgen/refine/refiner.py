@@ -33,7 +33,7 @@ EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the e
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
-FROM_NOTHING = 0.2  # share of the tolerance for motions from nothing, where small steps still lead far
+FROM_NOTHING = 0.1  # share of the tolerance for motions from nothing, where small steps still lead far
 
 
 @dataclass(frozen=True)
