@@ -16,6 +16,7 @@ from cnpgen.refine.grid import make_grid
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
+from cnpgen.refine.quadratic import Model, choose
 from cnpgen.refine.refiner import Pass
 from cnpgen.refine.sqp import Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
@@ -352,3 +353,33 @@ def test_a_valid_plan_that_is_off_the_table_by_more_than_a_tenth_of_the_toleranc
     outcome, off = outcome_and_height(first=wide, polish=replace(wide, points=256))
     assert outcome in {Outcome.SOLVED, Outcome.POLISHED}
     assert 1e-4 < off <= 1e-3
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.3])
+def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radius: float) -> None:
+    plan, tool = load("hit"), refiner("airhockey")
+    motion = tool.transcription(task(plan), tool.passes.first)
+    bounds = tool.bounds(task(plan), tool.passes.first, motion.end_residuals())
+    at = motion.evaluate(tool.straight(task(plan)))
+    model = Model(motion, at, bounds, bounds.violation(at.g), proximal=0.02, penalty=2.0)
+    held = choose(at.g, bounds, thin=6, near=0.4, leaps=motion.leaps(at, 0.45))
+    step = model.solve(held, np.full(motion.nx, radius))
+    assert step is not None
+
+    k, which = np.nonzero(held)
+    g, multipliers = at.g[k, which], step.multipliers[k, which]
+    rows, lower, upper = motion.rows(at, k, which), bounds.lower[k, which], bounds.upper[k, which]
+    reached, left = g + rows @ step.dx, np.maximum(step.left, 0.0)
+    above, below = np.maximum(g - upper, 0) * left, np.maximum(lower - g, 0) * left
+    free_above, free_below = np.where(g < lower, np.inf, upper + above), np.where(g > upper, -np.inf, lower - below)
+    assert np.all(np.abs(step.dx) <= radius * (1 + 1e-5))
+    assert np.all(reached <= free_above + 1e-5)
+    assert np.all(reached >= free_below - 1e-5)
+    np.testing.assert_allclose(reached[multipliers > 1e-9], free_above[multipliers > 1e-9], atol=1e-5)
+    np.testing.assert_allclose(reached[multipliers < -1e-9], free_below[multipliers < -1e-9], atol=1e-5)
+    slope = at.curvature @ step.dx + 0.02 * step.dx + at.gradient + rows.T @ multipliers
+    inside = np.abs(step.dx) < radius * (1 - 1e-5)
+    np.testing.assert_allclose(slope[inside], 0, atol=1e-6)
+    assert np.all(slope[~inside] * np.sign(step.dx[~inside]) < 1e-6)
+    assert inside.any()
+    assert not inside.all()
