@@ -82,7 +82,7 @@ def test_casadis_solvers_end_at_least_as_good_as_the_own_one(solver: str) -> Non
     which = tool.passes.first
     own = tool.minimise(asked, which, tool.straight(asked))
     motion, bounds = tool.transcription(asked, which), tool._bounds[which].of(asked.start_xyz)
-    other = minimise_with(motion, bounds, tool.straight(asked), Settings(), solver=solver)
+    other = minimise_with(motion, bounds, tool.straight(asked), which.settings, solver=solver)
     assert bounds.violation(motion.value(other.x)[1]) == pytest.approx(other.violation, abs=1e-12)  # another kernel
     assert other.violation < Settings().violation_tolerance
     assert other.cost < own.cost * 1.001

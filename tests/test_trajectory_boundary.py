@@ -136,6 +136,10 @@ def test_a_path_of_a_single_span_is_refused() -> None:
 
 
 def test_conditions_of_different_joints_are_refused_by_name() -> None:
-    boundary = draw_boundary(np.random.default_rng(2), goal_ddq=False)
-    with pytest.raises(UsageError, match=f"same joints, got of each: start_q {JOINTS}, .*goal_q {JOINTS + 1}"):
-        replace(boundary, goal_q=np.zeros((N, JOINTS + 1)))
+    random = np.random.default_rng(2)
+    spec = draw_spec(random)
+    rate = np.ones((N, spec.rate_control_points))
+    mixed = replace(draw_boundary(random, goal_ddq=False), goal_q=np.zeros((N, JOINTS + 1)))
+    for points in (start_points, goal_points):
+        with pytest.raises(UsageError, match=f"same joints, got of each: start_q {JOINTS}, .*goal_q {JOINTS + 1}"):
+            points(mixed, rate, spec)

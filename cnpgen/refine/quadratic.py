@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dtrtri
 
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.transcription import Evaluation, Transcription
@@ -105,6 +104,8 @@ class Model:
     @cached_property
     def _unwhiten(self) -> Array | None:
         """What turns variables in which the Hessian is 1 into steps, shape (nx, nx); None where it is not positive."""
+        from scipy.linalg.lapack import dpotrf, dtrtri
+
         hessian = self.at.curvature.copy()
         hessian.flat[:: len(hessian) + 1] += self.proximal
         factor, failed = dpotrf(hessian, lower=True)

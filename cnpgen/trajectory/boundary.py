@@ -24,9 +24,6 @@ class Boundary:
         goal_q: Goal positions [rad].
         goal_dq: Goal velocities [rad/s].
         goal_ddq: Goal accelerations [rad/s^2], or None where they are free.
-
-    Raises:
-        UsageError: They are of different numbers of joints.
     """
 
     start_q: Array
@@ -35,12 +32,6 @@ class Boundary:
     goal_q: Array
     goal_dq: Array
     goal_ddq: Array | None = None
-
-    def __post_init__(self) -> None:
-        if len({np.shape(values)[-1:] for values in vars(self).values() if values is not None}) > 1:
-            joints = ((name, np.shape(values)) for name, values in vars(self).items() if values is not None)
-            found = ", ".join(f"{name} {shape[-1] if shape else None}" for name, shape in joints)
-            raise UsageError(f"boundary conditions must all be of the same joints, got of each: {found}")
 
     @property
     def fixed_at_goal(self) -> int:
@@ -71,7 +62,11 @@ def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array
 
     Returns:
         Shape (N, 3, n).
+
+    Raises:
+        UsageError: Boundary conditions of different numbers of joints are mixed.
     """
+    _check_joints(boundary)
     path, speed = _end_derivatives(spec)
     slope = speed.eta * (rate[:, 1:2] - rate[:, :1])
     return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], slope=slope, path=path)
@@ -87,7 +82,11 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
     Returns:
         Shape (N, 2 or 3, n).
+
+    Raises:
+        UsageError: Boundary conditions of different numbers of joints are mixed.
     """
+    _check_joints(boundary)
     path, speed = _end_derivatives(spec)
     # Reversed in phase, r' and p' change sign: the goal is a start with -dq.
     if boundary.goal_ddq is None:
@@ -96,6 +95,14 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     slope = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
     points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], slope=slope, path=path)
     return points[:, ::-1]
+
+
+def _check_joints(boundary: Boundary) -> None:
+    """Refuse conditions that are of different robots, before NumPy does in its own words."""
+    joints = {name: np.shape(values)[-1:] for name, values in vars(boundary).items() if values is not None}
+    if len(set(joints.values())) > 1:
+        found = ", ".join(f"{name} {n[0] if n else None}" for name, n in joints.items())
+        raise UsageError(f"boundary conditions must all be of the same joints, got of each: {found}")
 
 
 def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivatives]:
