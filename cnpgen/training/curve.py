@@ -67,7 +67,7 @@ def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
             axis.axhline(budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8)
     axis.set_ylabel("terms (dashed: budgets)")
     axis.set_yscale("log")
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)  # beside the curves
 
 
 def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
@@ -76,7 +76,7 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
         axis.plot(seconds, [100 * record["validation"][name] for record in checks], marker=".", label=label)
     axis.set_ylabel("valid plans [%]")
     axis.set_ylim(0, 101)
-    axis.legend()
+    axis.legend(loc="lower right")
 
 
 def _draw_times(axis: "Axes", checks: list[dict[str, Any]]) -> None:
