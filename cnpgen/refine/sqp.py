@@ -9,8 +9,8 @@ A merit function alone refuses good steps along a curved manifold, since they le
 step is also taken for the objective's sake if it violates no more than the width of a funnel, which narrows each time.
 
 Along flat directions of the objective steps never become short, and every one of them breaks residuals by its square.
-Once a step has changed the objective by less than the tolerance, a heavy proximal term keeps the next ones to what
-makes the iterate feasible: it lands.
+Once a step has changed the objective by less than the tolerance, and promised no more, a heavy proximal term keeps the
+next ones to what makes the iterate feasible: it lands.
 """
 
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Settings:
         penalty: Weight of the worst violation in the merit function.
         funnel: First width of the funnel, a violation.
         far: A start that violates more is none.
-        cost_tolerance: Relative change of the objective below which it has settled.
+        cost_tolerance: Relative change of the objective, promised and reached, below which it has settled.
         violation_tolerance: Worst scaled violation of a feasible iterate.
         thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
     """
@@ -180,7 +180,7 @@ class _Descent:
                 self._radius = min(2.5 * self._radius, LARGEST) if size > 0.8 * self._radius else self._radius
             elif reduction < POOR * predicted:
                 self._radius *= 0.5
-            self._settled = abs(self.cost - cost) < settings.cost_tolerance * cost
+            self._settled = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
             self.ended = self._settled and violation < settings.violation_tolerance
             self._at, self.x, self.cost, self.violation, self._length = None, x, cost, violation, size
             self._missed[:] = False
