@@ -39,6 +39,7 @@ from cnpgen.threads import one_thread
 from cnpgen.trajectory.motion import Motion
 
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")
+RUNS = 5  # of the grid
 SMALL = {"fresh": (60, 60, 20), "ipopt": 4, "height": 30, "slsqp": 2, "workers": 100}
 FULL = {"fresh": (1000, 1000, 300), "ipopt": 30, "height": 200, "slsqp": 10, "workers": 1500}
 VALID = {"airhockey-hit": 0.995, "airhockey-replan": 0.995, "heavy-object": 0.97}
@@ -48,11 +49,15 @@ Result = tuple[dict[str, Any], list[str]]
 
 
 def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Solve the 81 hits."""
+    """Solve the 81 hits; of every plan the least of some runs' times counts, which other jobs disturbed least."""
     problems = grid_of_hits()
-    made = {"from nothing": make_each(problems, RefineOptions())}
-    starts = like_a_networks(problems, made["from nothing"], options.seed)
-    made["network-like start"] = make_each(starts, RefineOptions())
+    starts = like_a_networks(problems, make_each(problems, RefineOptions()), options.seed)
+    plans = {"from nothing": problems, "network-like start": starts}
+    runs = [{start: make_each(given, RefineOptions()) for start, given in plans.items()} for _ in range(RUNS)]
+    made = {
+        start: [min(same, key=lambda each: each.ms) for same in zip(*(run[start] for run in runs), strict=True)]
+        for start in plans
+    }
     targets = {"from nothing": 40.0, "network-like start": 15.0}
     facts, rows = {}, []
     for start, found in made.items():
@@ -61,7 +66,7 @@ def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
         met = verdict(ms, targets[start], at_most=True)
         rows.append((start, str(valid), *verdict(valid, 81), *shown(found), f"{judging:.1f}", *met))
     head = ("start", "valid", "target", "", *SHOWN, "of it verdicts", "target", "")
-    return {"grid": facts}, [table("81 hits from rest, CPU time per plan [ms]", head, rows)]
+    return {"grid": facts}, [table(f"81 hits from rest, CPU time per plan [ms], least of {RUNS} runs", head, rows)]
 
 
 def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points
 EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exceed within the tolerances
+NEGLIGIBLE = 1e-5  # of scaled residuals: iterations end with larger violations than that
 SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
 
 
@@ -104,6 +105,8 @@ class BoundsTemplate:
 
     def _eased(self, bounds: Bounds, ends: Array) -> Bounds:
         lower, upper = bounds.lower, bounds.upper
+        if not np.fmax.reduce(bounds.beyond(ends), axis=None) > NEGLIGIBLE:
+            return bounds
         for g, row, s in ((ends[0], 0, self._s), (ends[1], -2, 1 - self._s)):  # the last row has bounds of few only
             open_ = np.clip((EASE[1] - s) / (EASE[1] - EASE[0]), 0.0, 1.0)[:, None]
             above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
