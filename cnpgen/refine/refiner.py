@@ -33,7 +33,7 @@ EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the e
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
-FROM_NOTHING = 0.1  # share of the tolerance for motions from nothing, where small steps still lead far
+FROM_NOTHING, CROWDED = 0.1, 0.05  # of the tolerance: small steps still lead far from nothing, and among obstacles
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def default_passes(problem: Problem, settings: Settings) -> Passes:
     strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE)
     near = replace(settings, radius=WARM_RADIUS)
     short = replace(near, max_iterations=settings.max_iterations // 2)
-    cold = replace(settings, cost_tolerance=FROM_NOTHING * settings.cost_tolerance)
+    cold = replace(settings, cost_tolerance=(CROWDED if crowded else FROM_NOTHING) * settings.cost_tolerance)
     longer = replace(cold, max_iterations=settings.max_iterations * 3 // 2)
     return Passes(
         Pass(128, room, replace(near, funnel=WIDE_FUNNEL, far=FAR)),
