@@ -197,7 +197,9 @@ def wide_band(problems: Plans) -> Refiner:
     problem, robot = open_problem(problems.problem)
     usual = default_passes(problem, Settings())
     wider = {name: replace(each, tightening=replace(each.tightening, band=0.9)) for name, each in vars(usual).items()}
-    return load_refiner(problem, robot, passes=Passes(**wider))
+    tool = load_refiner(problem, robot, passes=Passes(**wider))
+    tool.check.equalities = set()  # plans that use the tolerance are not to be polished for it
+    return tool
 
 
 def off_height(problems: Plans, found: list[Made]) -> list[float]:

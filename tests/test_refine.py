@@ -25,6 +25,7 @@ from cnpgen.refine.transcription import Stage, Transcription
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import chebyshev
+from cnpgen.verdict import Verdict
 from cnpgen.verify.world import World
 
 LABELS = ("hit", "replan", "transport")
@@ -339,20 +340,41 @@ def test_a_valid_plan_that_is_off_the_table_by_more_than_a_tenth_of_the_toleranc
     plan = load("hit")
     usual = refiner("airhockey").passes
     wide = replace(usual.first, tightening=replace(usual.first.tightening, band=0.4))
-    jury = Jury(plan.problem, plan.robot, degree=7)
+    jury = CountingJury(plan.problem, plan.robot, degree=7)
 
     def outcome_and_height(**passes: Pass) -> tuple[Outcome, float]:
+        jury.count = 0
         found = refine_task(refiner_of(plan.problem, passes=replace(usual, **passes)), jury, task(plan))
         seen = verdict(plan, plan.boundary, found.path, found.rate)
         assert seen.valid
         return found.outcome, seen.margins["table height"].excess
 
     outcome, off = outcome_and_height(first=wide)
-    assert outcome == Outcome.POLISHED
+    assert (outcome, jury.count) == (Outcome.POLISHED, 2)
     assert off <= 1e-4
-    outcome, off = outcome_and_height(first=wide, polish=replace(wide, points=256))
-    assert outcome in {Outcome.SOLVED, Outcome.POLISHED}
+    _, off = outcome_and_height(first=wide, polish=replace(wide, points=256))
+    assert jury.count == 2
     assert 1e-4 < off <= 1e-3
+    outcome, off = outcome_and_height()
+    assert (outcome, jury.count) == (Outcome.SOLVED, 1)
+    assert off <= 1e-4
+
+
+def test_only_what_the_ends_miss_of_equalities_makes_plans_less_precise() -> None:
+    plan, check = load("hit"), refiner("airhockey").check
+    fast = replace(plan.boundary, goal_dq=1.5 * plan.boundary.goal_dq)
+    assert check.refutes_ends(task(plan, fast))
+    assert check.imprecision_of_ends(task(plan)) < 1e-6
+    off = raised(plan, 5.4e-3)  # of which the start band allows 5 mm
+    assert check.imprecision_of_ends(task(off)) == pytest.approx(0.4, abs=0.01)
+
+
+class CountingJury(Jury):
+    count = 0
+
+    def verdict(self, *arguments: object) -> Verdict:
+        self.count += 1
+        return super().verdict(*arguments)
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.3])
@@ -383,3 +405,6 @@ def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radiu
     assert np.all(slope[~inside] * np.sign(step.dx[~inside]) < 1e-6)
     assert inside.any()
     assert not inside.all()
+    again = model.solve(held, np.full(motion.nx, radius), warm=step.multipliers)
+    np.testing.assert_allclose(again.dx, step.dx, atol=1e-6)
+    assert model.solve(held, np.full(motion.nx, radius), relax=True).left <= step.left + 1e-6

@@ -57,7 +57,8 @@ def add_refining(parser: argparse._ActionsContainer) -> None:
         "--tolerance",
         metavar="X",
         type=float,
-        help="relative change of the objective below which it has settled, from nothing a tenth of it (default: 1e-3)",
+        help="relative change of the objective below which it has settled (default: 1e-3; from nothing a tenth of it,"
+        " among obstacles a twentieth)",
     )
     option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms, at most 10ms)")
     option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")

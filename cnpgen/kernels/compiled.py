@@ -81,8 +81,8 @@ def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
 
 def _address(array: Any) -> int:
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # a third of the time of what follows
-    except (TypeError, ValueError, BufferError):  # of read-only, strided and empty arrays
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # takes a third of the time of what follows
+    except (TypeError, ValueError):  # read-only, strided, or empty
         return int(array.__array_interface__["data"][0])
 
 

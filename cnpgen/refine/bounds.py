@@ -98,7 +98,8 @@ class BoundsTemplate:
         Args:
             start_tip: Where the tip is at the start [m], shape (3,).
             ends: Residuals of the boundary states, shape (2, m), nan where they are free. Bounds near an end that is
-                off by no more than the verdict allows are as wide as that: no motion could meet narrower ones.
+                off by more than is negligible and no more than the verdict allows are as wide as that: no motion could
+                meet narrower ones.
         """
         bounds = self._of(start_tip)
         return bounds if ends is None else self._eased(bounds, ends)

@@ -65,7 +65,9 @@ class FineCheck:
                 for each, condition in conditions
             ]
         )
-        self.equalities = {each.name for _, each in conditions if np.array_equal(each.lower, each.upper)}
+        equal = [np.array_equal(condition.lower, condition.upper) for _, condition in conditions]
+        self.equalities = {condition.name for (_, condition), same in zip(conditions, equal, strict=True) if same}
+        self._equal = np.repeat(equal, [len(condition.g) for _, condition in conditions])
         self._needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in conditions])
 
     def transcription(self, task: Task) -> Transcription:
@@ -88,14 +90,17 @@ class FineCheck:
         speed, strength = (size[self._needs == needs].max(initial=1.0) for needs in (1, 2))
         return cost, Excess(worst, bool(high[:, self._needs == 0].any()), max(speed, float(np.sqrt(strength))))
 
-    def excess_of_ends(self, task: Task) -> float:
-        """By how much the boundary conditions alone exceed a bound, as a multiple of what is allowed."""
-        bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)
-        return float(np.nanmax(bounds.beyond(motion.end_residuals()) / np.maximum(self._allowed, ROUNDING)))
-
     def refutes_ends(self, task: Task) -> bool:
         """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
-        return self.excess_of_ends(task) > CERTAIN
+        return bool(np.nanmax(self._excess_of_ends(task)) > CERTAIN)
+
+    def imprecision_of_ends(self, task: Task) -> float:
+        """By how much the boundary conditions alone miss an equality, as a multiple of what is allowed."""
+        return float(np.fmax.reduce(self._excess_of_ends(task)[:, self._equal], axis=None, initial=0.0))
+
+    def _excess_of_ends(self, task: Task) -> Array:
+        bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)
+        return np.asarray(bounds.beyond(motion.end_residuals()) / np.maximum(self._allowed, ROUNDING))
 
     def slow_down(
         self, task: Task, motion: Transcription, x: Array, *, at_any_cost: bool = False

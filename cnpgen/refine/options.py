@@ -21,7 +21,7 @@ class RefineOptions:
         solver: "own": sequential quadratic programming with DAQP; "ipopt" and "sqpmethod" are CasADi's.
         max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down.
         tolerance: Relative change of the objective below which it has settled: what follows only makes it feasible.
-            From nothing 0.4 of it count.
+            From nothing a tenth of it counts, among obstacles a twentieth.
         step: The verdict looks at moments no further apart than this [s].
 
     Raises:

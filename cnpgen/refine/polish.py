@@ -58,7 +58,7 @@ class _Search:
     hopeless: list[Attempt] = field(default_factory=list)
 
     def offer(self, attempt: Attempt) -> bool:
-        """Take an attempt in; return whether that will do: one is valid and precise, or just valid since before."""
+        """Take an attempt in; return whether that will do: it is valid and precise, or one before it was valid."""
         self.iterations += attempt.iterations
         enough = any(each.refined.valid for each in self.judged)
         if attempt.excess > HOPELESS:
@@ -91,7 +91,7 @@ class _Search:
     def _is_precise(self, verdict: Verdict) -> bool:
         check = self.refiner.check
         worst = max((each.severity for each in verdict.margins.values() if each.name in check.equalities), default=0.0)
-        return worst <= PRECISE or worst <= PRECISE + check.excess_of_ends(self.task)
+        return worst <= PRECISE or worst <= PRECISE + check.imprecision_of_ends(self.task)
 
     def _candidate(self, attempt: Attempt) -> _Candidate:
         path, rate = self.refiner.check.transcription(self.task).unpack(attempt.x)

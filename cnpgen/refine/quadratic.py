@@ -95,11 +95,12 @@ class Model:
             primal_tol=FEASIBLE,
             iter_limit=CHANGES,
         )
-        if flag < 1 or not np.isfinite(solution).all():
+        dx = unwhiten @ solution[:-1]
+        if flag < 1 or not np.isfinite(dx).all():
             return None
         multipliers = np.zeros(self.at.g.shape)
         multipliers[k, which] = info["lam"][nx + 1 :]
-        return Step(unwhiten @ solution[:-1], float(solution[-1]) / SOFTNESS, multipliers)
+        return Step(dx, float(solution[-1]) / SOFTNESS, multipliers)
 
     @cached_property
     def _unwhiten(self) -> Array | None:
@@ -109,11 +110,15 @@ class Model:
         hessian = self.at.curvature.copy()
         hessian.flat[:: len(hessian) + 1] += self.proximal
         factor, failed = dpotrf(hessian, lower=True)
-        inverse, _ = dtrtri(factor, lower=True)
-        return None if failed else np.asarray(inverse.T)
+        return None if failed else np.asarray(dtrtri(factor, lower=True)[0].T)
 
     def _rows(self, k: Indices, which: Indices, unwhiten: Array, *, relax: bool) -> tuple[Array, Array, Array]:
-        """Gradients of the box, the elastic variable and held residuals, and how far residuals may fall and rise."""
+        """Lay out what is bounded, and how far it may go.
+
+        Returns:
+            ``(rows, low, high)``: gradients of the box, the elastic variable and m held residuals, shape
+            (nx + 1 + m, nx + 1), and how far the residuals may fall and rise, shape (m,) each.
+        """
         g, lower, upper = self.at.g[k, which], self.bounds.lower[k, which], self.bounds.upper[k, which]
         nx = self.motion.nx
         rows = np.zeros((nx + 1 + len(k), nx + 1))
