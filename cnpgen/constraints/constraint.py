@@ -59,6 +59,11 @@ class Condition:
     exactness: str
     needs: int = 0
 
+    @property
+    def is_equality(self) -> bool:
+        """Whether it allows one value only."""
+        return bool(np.array_equal(self.lower, self.upper))
+
     def slack(self, dtype: str) -> NDArray[np.float64]:
         """How far g may be outside its bounds on a boundary state stored as ``dtype``, in the unit of g, shape (m,)."""
         exact = EXACTNESS[dtype][self.exactness]

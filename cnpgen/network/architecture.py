@@ -61,6 +61,9 @@ class Architecture:
     path_outputs: int
     rate_outputs: int
 
+    def __str__(self) -> str:
+        return f"{self.layers} x {self.hidden}"
+
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value < 1:

@@ -96,7 +96,7 @@ def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array]:
 
 
 def _is_equality(condition: Condition) -> bool:
-    return condition.needs == 0 and bool(np.array_equal(condition.lower, condition.upper))
+    return condition.needs == 0 and condition.is_equality
 
 
 def _any_conditions(robot: "Robot", problem: Problem) -> list[Condition]:

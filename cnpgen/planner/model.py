@@ -70,8 +70,7 @@ class Model:
     log: str = ""
 
     def __repr__(self) -> str:
-        size = f"{self.architecture.layers} x {self.architecture.hidden}"
-        return f"<Model of {self.problem.name!r}: a network of {size}>"
+        return f"<Model of {self.problem.name!r}: a network of {self.architecture}>"
 
     def outputs(self, tasks: Tasks) -> Outputs:
         """Ask the network for N tasks: in float32 itself, sums and the exponential in float64."""

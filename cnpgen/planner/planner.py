@@ -57,9 +57,7 @@ class Planner:
             self._still["goal_dq"] = self._still["start_dq"]
 
     def __repr__(self) -> str:
-        network = self.model.architecture
-        size = f"{network.layers} x {network.hidden}"
-        return f"<Planner for {self.model.problem.name!r}: a network of {size}>"
+        return f"<Planner for {self.model.problem.name!r}: a network of {self.model.architecture}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without kernels: they are loaded anew where the planner goes."""

@@ -76,6 +76,11 @@ class BoundsTemplate:
         world: Any world of it: the bounds are read off its conditions.
         s: Phases of the grid, shape (K,).
         tightening: How much to tighten.
+
+    Attributes:
+        conditions: The conditions whose values the residuals are.
+        allowed: What the verdict allows residuals to exceed, in scaled units, shape (m,).
+        needs: The highest derivative of q that each residual depends on, shape (m,).
     """
 
     def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
@@ -87,10 +92,11 @@ class BoundsTemplate:
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._funnels = list(_funnels(pairs))
-        self._allowed = np.concatenate([each.allowed(condition) / _scale(each, condition) for each, condition in pairs])
-        needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in pairs])
+        self.conditions = [condition for _, condition in pairs]
+        self.allowed = np.concatenate([each.allowed(condition) / _scale(each, condition) for each, condition in pairs])
+        self.needs = np.concatenate([np.full(len(each.g), each.needs) for each in self.conditions])
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
-        self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = needs == 2
+        self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs == 2
 
     def of(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:
         """Return the bounds of one motion.
@@ -112,9 +118,9 @@ class BoundsTemplate:
             open_ = np.clip((EASE[1] - s) / (EASE[1] - EASE[0]), 0.0, 1.0)[:, None]
             above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
             if np.any(above > 0):
-                upper = np.asfortranarray(upper + np.minimum(above, self._allowed) * open_)
+                upper = np.asfortranarray(upper + np.minimum(above, self.allowed) * open_)
             if np.any(below > 0):
-                lower = np.asfortranarray(lower - np.minimum(below, self._allowed) * open_)
+                lower = np.asfortranarray(lower - np.minimum(below, self.allowed) * open_)
         return Bounds(lower, upper, bounds.sharp)
 
     def _of(self, start_tip: Array) -> Bounds:
@@ -153,7 +159,7 @@ def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: 
         shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
         middle, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = middle - shrink * half, middle + shrink * half
-    elif np.array_equal(condition.lower, condition.upper):
+    elif condition.is_equality:
         band = tightening.band * constraint.tolerance / scale
         lower, upper = lower - band, upper + band
     else:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from cnpgen.recipes import Problem
 from cnpgen.refine.bounds import BoundsTemplate, Tightening
 from cnpgen.refine.grid import make_grid
-from cnpgen.refine.stage import residual_scale
 from cnpgen.refine.task import Task
 from cnpgen.refine.transcription import Stage, Transcription, of_last
 
@@ -57,18 +56,9 @@ class FineCheck:
         self._last = of_last(lambda task: Transcription(stage, self._grid, boundary=task.boundary, tops=task.tops))
         none = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
         self._bounds = BoundsTemplate(problem, world, self._grid.s, none)
-        conditions = [(each, condition) for each in problem.constraint for condition in each.measured(world)]
-        self._allowed = np.concatenate(
-            [
-                each.allowed(condition)
-                / residual_scale(condition.lower, condition.upper, each.tolerance, condition.exactness)
-                for each, condition in conditions
-            ]
-        )
-        equal = [np.array_equal(condition.lower, condition.upper) for _, condition in conditions]
-        self.equalities = {condition.name for (_, condition), same in zip(conditions, equal, strict=True) if same}
-        self._equal = np.repeat(equal, [len(condition.g) for _, condition in conditions])
-        self._needs = np.concatenate([np.full(len(condition.g), condition.needs) for _, condition in conditions])
+        conditions = self._bounds.conditions
+        self.equalities = {each.name for each in conditions if each.is_equality}
+        self._equal = np.repeat([each.is_equality for each in conditions], [len(each.g) for each in conditions])
 
     def transcription(self, task: Task) -> Transcription:
         """Return the motion on the fine grid; for one task it is asked for many times."""
@@ -81,14 +71,14 @@ class FineCheck:
         bounds = self._bounds.of(task.start_xyz)
         with np.errstate(invalid="ignore"):
             beyond = np.maximum(g - bounds.upper, bounds.lower - g)
-        ratio = beyond / np.maximum(self._allowed, ROUNDING)
+        ratio = beyond / np.maximum(self._bounds.allowed, ROUNDING)
         worst = float(ratio.max())
         if not np.isfinite(worst):
             return cost, Excess(np.inf, True, np.inf)
         high = ratio > 1
         size = np.abs(np.where(high, g, 0.0)).max(axis=0, initial=0.0)
-        speed, strength = (size[self._needs == needs].max(initial=1.0) for needs in (1, 2))
-        return cost, Excess(worst, bool(high[:, self._needs == 0].any()), max(speed, float(np.sqrt(strength))))
+        speed, strength = (size[self._bounds.needs == needs].max(initial=1.0) for needs in (1, 2))
+        return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), max(speed, float(np.sqrt(strength))))
 
     def refutes_ends(self, task: Task) -> bool:
         """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
@@ -100,7 +90,7 @@ class FineCheck:
 
     def _excess_of_ends(self, task: Task) -> Array:
         bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)
-        return np.asarray(bounds.beyond(motion.end_residuals()) / np.maximum(self._allowed, ROUNDING))
+        return np.asarray(bounds.beyond(motion.end_residuals()) / np.maximum(self._bounds.allowed, ROUNDING))
 
     def slow_down(
         self, task: Task, motion: Transcription, x: Array, *, at_any_cost: bool = False

@@ -33,7 +33,7 @@ EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the e
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
-FROM_NOTHING, CROWDED = 0.1, 0.05  # of the tolerance: small steps still lead far from nothing, and among obstacles
+FROM_NOTHING, CROWDED = 0.1, 0.05  # shares of the tolerance from nothing, where small steps still lead far
 
 
 @dataclass(frozen=True)
