@@ -22,6 +22,7 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Refined, Task
 from cnpgen.refine.tip_bound import Arm
 from cnpgen.solving import problems_of_rows
+from cnpgen.trajectory.boundary import assemble
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict.verdict import Verdict
 
@@ -113,21 +114,27 @@ def grid_of_hits() -> Plans:
 
 
 def like_a_networks(plans: Plans, made: list[Made], seed: int) -> Plans:
-    """Disturb plans as a network errs: the tip is 2 to 10 mm too high or low somewhere, velocities are 5 % too high."""
-    _, robot = open_problem(plans.problem)
+    """Disturb plans as a network errs: the tip is 2 to 10 mm too high or low somewhere, velocities are 5 % too high.
+
+    Their ends are exact as those of a network's plans are, which are built from what the rate begins and ends with.
+    """
+    problem, robot = open_problem(plans.problem)
     random, arm, s = np.random.default_rng(seed), Arm(robot), np.linspace(0, 1, 41)
     paths, rates = [], []
-    for each in made:
-        path, rate = each.refined.path, each.refined.rate
-        noise = np.zeros_like(path)
-        noise[3:-2] = _smooth(random.normal(size=noise[3:-2].shape))
+    for index, each in enumerate(made):
+        path, rate, boundary = each.refined.path, each.refined.rate, plans.boundary[index : index + 1]
+        noise, end = np.zeros_like(path), len(path) - boundary.fixed_at_goal
+        noise[3:end] = _smooth(random.normal(size=noise[3:end].shape))
         wanted, size = random.uniform(SMALLEST_Z, LARGEST_Z), 4e-3
         for _ in range(4):
             size *= wanted / _vertical(arm, path, path + size * noise, s)
         bent = path + size * noise
-        speed = np.abs(Motion(bent[None], rate[None], plans.degree).at(s).dq[0]) / robot.velocity_limit
+        for _ in range(4):
+            speed = np.abs(Motion(bent[None], rate[None], plans.degree).at(s).dq[0]) / robot.velocity_limit
+            rate = rate * TOO_FAST / speed.max()
+            bent = assemble(boundary, bent[None, 3:end], rate[None], problem.trajectory)[0]
         paths.append(bent)
-        rates.append(rate * TOO_FAST / speed.max())
+        rates.append(rate)
     return replace(plans, path_control_points=np.array(paths), rate_control_points=np.array(rates))
 
 

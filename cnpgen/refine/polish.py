@@ -14,6 +14,7 @@ from cnpgen.verdict.verdict import Reason, Verdict
 Array = NDArray[np.float64]
 
 PRECISE = 0.1  # of an equality's tolerance, beyond what the ends need: the optimiser's band is narrower
+SAME = 1e-12  # rad and 1/s: control points that differ by less are the same but for rounding
 HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless there is no better one
 
 
@@ -122,11 +123,15 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
 
 
 def _as_given(refiner: Refiner, task: Task, given: Array | None) -> list[tuple[Array, Array]]:
-    """Return the plan as it was given, where it can be evaluated: with exact ends, and as it is."""
-    plans = [] if given is None else [refiner.check.transcription(task).unpack(given)]
+    """Return the plan as it was given, where it can be evaluated: as it is, and with exact ends if it had others."""
+    plans = []
     if task.path is not None and task.rate is not None and np.isfinite(task.path).all():
         forward = Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]
         plans += [(task.path, task.rate)] if forward else []
+    if given is not None:
+        path, rate = refiner.check.transcription(task).unpack(given)
+        if not plans or np.abs(path - plans[0][0]).max() > SAME or np.abs(rate - plans[0][1]).max() > SAME:
+            plans.append((path, rate))
     return plans
 
 
