@@ -79,14 +79,19 @@ def test_derivatives_are_those_of_the_residuals(problem: str, name: str) -> None
         np.testing.assert_allclose(np.array(jacobian(*state)), expected, rtol=1e-6, atol=1e-6)
 
 
-def test_a_robot_inside_an_obstacle_has_no_gradient_but_no_nan() -> None:
+def test_a_robot_inside_an_obstacle_has_a_depth_and_a_gradient() -> None:
     residuals, jacobian = derivative("heavy-object", "robot-clearance")
     q = np.array([0.95, 1.2, 0, -0.4, 0, 0, 0])  # stretched out to the side, through pedestal 2
     state = [q, 0 * q, 0 * q, np.full(2, 0.6)]
     g, found = np.array(residuals(*state)).ravel(), np.array(jacobian(*state))
-    assert g.min() < 1e-14
+    deepest, step = int(np.argmin(g)), 1e-7
+    assert g[deepest] < -0.05
     assert np.isfinite(found).all()
-    assert not found[np.argmin(g)].any()
+    for joint in range(7):
+        near = [np.array(residuals(q + sign * step * np.eye(7)[joint], *state[1:])).ravel() for sign in (1, -1)]
+        slope = (near[0] - near[1])[deepest] / (2 * step)
+        assert found[deepest, joint] == pytest.approx(slope, abs=1e-6)
+    assert np.abs(found[deepest]).max() > 0.1
 
 
 @pytest.mark.parametrize("problem", ["airhockey", "heavy-object"])

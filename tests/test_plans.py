@@ -289,6 +289,7 @@ def test_another_robot_file_is_another_problem() -> None:
         ({"start_q": np.zeros((3, 6), complex)}, "start_q must hold floats, got complex128"),
         ({"start_q": np.full((3, 6), b"x")}, r"start_q must hold floats, got \|S1"),
         ({"sample_id": np.zeros(3)}, "sample_id must hold integers, got float64"),
+        ({"sample_id": np.full(3, 2**63, np.uint64)}, r"sample_id must hold integers below 2\^63, got 9223372036854775808"),
         ({"names": np.array([b"a", b"b", b"c"])}, "names must hold numbers"),
         (
             {"attributes": {"problem": "airhokey"}},
@@ -297,7 +298,7 @@ def test_another_robot_file_is_another_problem() -> None:
         ({"attributes": {"problem": "no/problem.toml"}}, "no such file: .*problem.toml"),
         ({"attributes": {"problem": 3}}, "attribute 'problem' must be a text, got"),
         ({"attributes": {"degree": 7.5}}, "attribute 'degree' must be an integer, got"),
-        ({"attributes": {"degree": 1}}, "degree must be at least 3, got 1"),
+        ({"attributes": {"degree": 1}}, "degree must be an integer from 3 on, got 1"),
         ({"attributes": {"degree": [7, 7]}}, "attribute 'degree' must be an integer"),
         ({"attributes": {"format": "cnpgen-shard"}}, "is a cnpgen-shard file, not one of plans"),
         ({"attributes": {"format_version": 2}}, "format version 2, this cnpgen reads 1: upgrade"),
@@ -531,6 +532,24 @@ def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(name: 
         make_plans(plans.problem, others, **points)
     with pytest.raises(UsageError, match=f"{name} must be an array of numbers with rows of equal length"):
         make_plans(plans.problem, replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}), **points)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sample_id": [0.7, 1.2, 2.9]}, "sample_id must hold integers from .* got float64"),
+        ({"sample_id": np.full(3, 2**63, np.uint64)}, "sample_id must hold integers from .* to 9223372036854775807"),
+        ({"sample_id": ["a", "b", "c"]}, "sample_id must be an array of integers"),
+        ({"status": [300, 0, 0]}, "status must hold integers from 0 to 255"),
+        ({"degree": 7.5}, "degree must be an integer from 3 on, got 7.5"),
+        ({"columns": {".": np.zeros(3)}}, "a column cannot be called '.'"),
+    ],
+)
+def test_numbers_that_would_change_when_stored_are_refused(wrong: dict[str, Any], message: str) -> None:
+    plans = draw_plans(3)
+    points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
+    with pytest.raises(UsageError, match=message):
+        make_plans(plans.problem, plans.boundary, **points, **wrong)
 
 
 @pytest.mark.parametrize("content", [b"precious", b"cnpgen-model 1\n", b"\x89HDF\r\n\x1a\n", "shard"])

@@ -115,6 +115,10 @@ def test_objectives_are_chosen_by_name_and_nonsense_is_refused() -> None:
         RefineOptions(objective="effort", weight=-1.0)
     with pytest.raises(UsageError, match="tolerance must be between 0 and 1, got 0"):
         RefineOptions(tolerance=0)
+    with pytest.raises(UsageError, match="max_iterations must be an integer from 0 on, got 2.5"):
+        RefineOptions(max_iterations=2.5)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=r"the time step must be above 0 and at most 0\.001 s, got 0\.01 s"):
+        RefineOptions(step=0.01)
 
 
 @pytest.mark.parametrize("label", LABELS)
@@ -259,6 +263,36 @@ def test_a_tolerance_of_zero_is_held_exactly_or_honestly_missed(kind: str) -> No
     found = refine(plan)
     assert verdict(plan, plan.boundary, found.path, found.rate).valid == found.valid
     assert found.valid == (kind not in {"Table", "JointVelocity"})  # whose limit the goal is at
+
+
+def test_where_nothing_is_allowed_a_plan_that_breaks_more_does_not_win_by_its_time() -> None:
+    plan = load("hit").with_constraint("JointVelocity", tolerance=0.0)
+    nearly = refine(plan)
+    assert not nearly.valid
+    rate = nearly.rate.copy()
+    rate[2:-2] *= 1.8
+    found = refine(plan, path=nearly.path, rate=rate)
+    assert found.outcome is Outcome.UNSOLVED
+    excess = verdict(plan, plan.boundary, found.path, found.rate).margins["joint velocity"].excess
+    assert 0 < excess < 1e-9
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-9, 1e-3])
+def test_a_plan_that_is_kept_comes_back_with_exact_ends_and_says_so_if_it_had_others(off: float) -> None:
+    plan = load("hit")
+    best = refine(plan)
+    path = best.path + off * np.eye(len(best.path))[-1][:, None]  # its last control point
+    as_it_is = refiner_of(plan.problem, settings=Settings(max_iterations=0))
+    jury = Jury(plan.problem, plan.robot, degree=7)
+    found = refine_task(as_it_is, jury, task(plan, path=path, rate=best.rate))
+    assert found.valid
+    assert found.outcome is (Outcome.ADJUSTED if off else Outcome.KEPT)
+    assert np.array_equal(found.path, path) == (not off)
+    ends = Motion(found.path[None], found.rate[None]).at(np.array([0.0, 1.0]))
+    b = plan.boundary
+    np.testing.assert_allclose(ends.q[0], [b.start_q[0], b.goal_q[0]], atol=1e-10)
+    np.testing.assert_allclose(ends.dq[0], [b.start_dq[0], b.goal_dq[0]], atol=1e-10)
+    np.testing.assert_allclose(ends.ddq[0, 0], b.start_ddq[0], atol=1e-10 * (1 + np.abs(b.start_ddq).max()))
 
 
 @pytest.mark.parametrize(("degree", "path", "rate"), [(3, 5, 4), (3, 6, 4), (5, 7, 6), (7, 9, 8)])

@@ -13,7 +13,7 @@ from cnpgen.kernels.interpreted import InterpretedKernel
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.library import load_problem
 from cnpgen.recipes import LimitSpec, Problem, RobotSpec
-from cnpgen.robots.boxes import segment_box_distance, upright_box_separation
+from cnpgen.robots.boxes import segment_box_distance, segment_box_separation, upright_box_separation
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.robots.symbolic import (
     bias_acceleration,
@@ -196,11 +196,11 @@ def coal_distance(shape: object, rotation: np.ndarray, position: np.ndarray) -> 
     return coal.distance(shape, places[0], coal.Box(*(HIGH - LOW)), places[1], request, coal.DistanceResult())
 
 
-def coal_segment_distance(first: np.ndarray, second: np.ndarray) -> float:
+def coal_segment_separation(first: np.ndarray, second: np.ndarray) -> float:
     length = float(np.linalg.norm(second - first))
     along = (second - first) / length if length else np.array([0.0, 0.0, 1.0])
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).toRotationMatrix()
-    return max(coal_distance(coal.Capsule(0.0, length), rotation, (first + second) / 2), 0.0)
+    return coal_distance(coal.Capsule(0.0, length), rotation, (first + second) / 2)
 
 
 def segments(kind: str, count: int = 400) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -235,6 +235,12 @@ def segment_function() -> ca.Function:
     return ca.Function("segment", [first_sx, second_sx], [segment_box_distance(first, second, box_bounds())])
 
 
+@pytest.fixture(scope="module")
+def separation_function() -> ca.Function:
+    (first_sx, first), (second_sx, second) = symbols("first", 3), symbols("second", 3)
+    return ca.Function("separation", [first_sx, second_sx], [segment_box_separation(first, second, box_bounds())])
+
+
 @pytest.mark.parametrize(
     "kind",
     [
@@ -248,11 +254,13 @@ def segment_function() -> ca.Function:
         "of no length",
     ],
 )
-def test_segment_box_distance_agrees_with_coal(segment_function, kind):
+def test_segment_box_distances_agree_with_coal(segment_function, separation_function, kind):
     cases = list(segments(kind))
     found = np.array([float(segment_function(first, second)) for first, second in cases])
-    expected = np.array([coal_segment_distance(first, second) for first, second in cases])
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    expected = np.array([coal_segment_separation(first, second) for first, second in cases])
+    np.testing.assert_allclose(found, np.maximum(expected, 0), rtol=0, atol=1e-9)
+    separation = np.array([float(separation_function(first, second)) for first, second in cases])
+    np.testing.assert_allclose(separation, expected, rtol=0, atol=2e-9)
     if kind in {"inside", "touching the top"}:
         np.testing.assert_array_equal(found, 0.0)
 

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.motion import Motion, States
-from cnpgen.trajectory.spline import clamped_knots
+from cnpgen.trajectory.spline import clamped_knots, extremes
 
 FIELDS = tuple(States.__annotations__)
 
@@ -130,6 +130,37 @@ def test_motions_that_stop_or_go_back_last_for_ever() -> None:
     assert T[[0, 5]] == pytest.approx([1.0, 1.0], rel=0.2)
     assert np.isposinf(T[1:5]).all()
     assert np.isnan(T[6])
+
+
+@pytest.mark.parametrize("lowest", [1e-2, 1e-3, 1e-4, 1e-5])
+def test_a_rate_that_comes_close_to_zero_on_the_way_has_the_duration_that_adaptive_quadrature_finds(
+    lowest: float,
+) -> None:
+    random = np.random.default_rng(int(-np.log10(lowest)))
+    rate = np.concatenate([random.uniform(1, 4, (3, 20)), np.ones((1, 20))])
+    for row, index in zip(rate[:3], (5, 9, 14), strict=True):
+        low, high = -60.0, 0.0
+        for _ in range(80):
+            row[index] = (low + high) / 2
+            low, high = (low, row[index]) if extremes(row, 7)[1].min() > lowest else (row[index], high)
+        row[index] = high
+    assert (rate[:3].min(axis=1) < 0).all()
+    motion = Motion(np.zeros((4, 15, 1)), rate)
+    T = motion.duration()
+    for row, found in zip(rate, T, strict=True):
+        r = BSpline(clamped_knots(20, 7), row, 7)
+        near = extremes(row, 7)[0]
+        cuts = [near, *(near + sign * 10.0**power for sign in (1, -1) for power in range(-6, 0))]
+        edges = np.unique(np.clip(np.concatenate([np.linspace(0, 1, 14), *cuts]), 0, 1))
+        pieces = [quad(lambda s, r=r: 1 / r(s), a, b, epsrel=1e-11)[0] for a, b in pairwise(edges)]
+        assert found == pytest.approx(sum(pieces), rel=2e-9)
+    alone = [motion[[i]].duration()[0] for i in range(4)]
+    assert T.tolist() == alone
+    t = np.linspace(0, 1, 40) * T[:, None]
+    s = motion.phase_at(t)
+    back = np.array([motion[[i]].time_at(s[i])[0] for i in range(4)])
+    assert np.abs(back - t).max() < 1e-8 * T.max()
+    np.testing.assert_array_equal(motion.time_at(s[0])[0], back[0])
 
 
 def test_a_dip_below_zero_between_any_samples_is_seen() -> None:

@@ -11,10 +11,11 @@ from cnpgen.trajectory.spline import (
     basis,
     chebyshev,
     clamped_knots,
+    edges_around,
     end_derivatives,
+    extremes,
     graded_edges,
     horner,
-    lowest,
     pick,
     pieces,
 )
@@ -83,9 +84,19 @@ def test_the_lowest_value_is_found_between_any_samples() -> None:
     for _ in range(30):
         control = random.normal(size=20)
         sampled = float((basis(s, 20, 7) @ control).min())
-        assert sampled - 1e-5 <= lowest(control, 7) <= sampled + 1e-14
-    assert lowest(np.full(20, 0.7), 7) == pytest.approx(0.7, rel=1e-14)  # no turning points at all
-    assert lowest(np.arange(20.0) + 1, 7) == 1.0  # at an end
+        at, values = extremes(control, 7)
+        assert sampled - 1e-5 <= values.min() <= sampled + 1e-14
+        np.testing.assert_allclose(basis(at, 20, 7) @ control, values, atol=1e-14)
+    assert extremes(np.full(20, 0.7), 7)[1] == pytest.approx(0.7, rel=1e-14)  # it turns nowhere, or everywhere
+    assert extremes(np.arange(20.0) + 1, 7)[1].min() == 1.0  # at an end
+
+
+def test_cells_shrink_towards_phases_that_are_asked_for() -> None:
+    edges = edges_around(np.array([0.0, 0.3, 1.0]), 20, 7)
+    assert edges[[0, -1]].tolist() == [0, 1]
+    assert np.all(np.diff(edges) > 0)
+    assert np.isin(np.append(graded_edges(20, 7), 0.3), edges).all()
+    assert np.abs(np.diff(edges)[np.searchsorted(edges, 0.3)]) < 1e-8
 
 
 @pytest.mark.parametrize(("points", "degree"), SIZES)

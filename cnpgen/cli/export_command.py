@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
 FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.export, which takes a while to import
+NAMED = 10  # plans that are not valid, by number
 
 _TEXT = """\
 npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
@@ -50,6 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=chosen)
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
+    if exported.invalid:
+        print(f"cnpgen: warning: {_invalid(exported)}", file=sys.stderr)
     print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
     print(exported.files[0] if arguments.to == "npz" else out)
     return 1 if exported.refused else 0
@@ -60,6 +63,13 @@ def _counted(exported: "Exported") -> str:
 
     all_plans = exported.count + len(exported.refused)
     return counted(exported.count, "plan") + (f" of {all_plans:,}" if exported.refused else "")
+
+
+def _invalid(exported: "Exported") -> str:
+    """Name the exported plans that are known not to be valid."""
+    first, left = exported.invalid[:NAMED], len(exported.invalid[NAMED:])
+    which = ", ".join(map(str, first)) + (f" and {left:,} more" if left else "")
+    return f"not valid by their status ('cnpgen evaluate' says why): plan{'s' * (len(first) > 1)} {which}"
 
 
 def _place(arguments: argparse.Namespace) -> Path:

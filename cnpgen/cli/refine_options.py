@@ -60,7 +60,7 @@ def add_refining(parser: argparse._ActionsContainer) -> None:
         help="relative change of the objective below which it has settled (default: 1e-3; from nothing a tenth of it,"
         " among obstacles a twentieth)",
     )
-    option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms, at most 10ms)")
+    option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms, which is the most)")
     option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")
 
 

@@ -25,21 +25,19 @@ class RobotClearance(Constraint):
     tolerance: float = field("how deep a motion may enter and still be called valid", unit="m", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the distance of every moving segment from every obstacle [m]."""
-        from cnpgen.robots.boxes import segment_box_distance
+        """State the signed distance of every moving segment from every obstacle [m]."""
+        from cnpgen.robots.boxes import segment_box_separation
 
-        segments = state.segments
-        distances = [segment_box_distance(a, b, box) for a, b in segments for box in state.boxes]
-        return self._clear(distances)
+        return self._clear([segment_box_separation(a, b, box) for a, b in state.segments for box in state.boxes])
 
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the distances, negative inside, where ``symbolic`` is zero and has no gradient [m]."""
+        """State distances that are easier to descend: inside, the depth of the middle of what is inside [m]."""
         from cnpgen.robots.boxes import signed_segment_box_distance as distance
 
         return self._clear([distance(a, b, box, hold=state.hold) for a, b in state.segments for box in state.boxes])
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Measure the distances with Coal [m]."""
+        """Measure the signed distances with Coal [m]."""
         return self._clear(world.segment_distances())
 
     def _clear(self, distances: list[Any]) -> tuple[Condition, ...]:

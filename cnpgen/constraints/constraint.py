@@ -130,7 +130,7 @@ class Constraint(ABC):
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State what training penalises: by default ``symbolic``.
 
-        The same condition; overridden where the violation that ``symbolic`` states has no gradient.
+        The same condition; overridden where the violation that ``symbolic`` states is hard to descend.
         """
         return self.symbolic(state)
 

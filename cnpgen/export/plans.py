@@ -31,11 +31,13 @@ class Exported:
         files: The files that it wrote, in the order of the plans.
         count: How many plans are in them.
         refused: Index of each plan that could not be exported -> why, naming it.
+        invalid: Indices of the exported plans whose status says that they are not valid.
     """
 
     files: tuple[Path, ...]
     count: int
     refused: dict[int, str]
+    invalid: tuple[int, ...] = ()
 
 
 def export_plans(
@@ -75,7 +77,8 @@ def export_plans(
         reasons = "; ".join(list(refused.values())[:3])
         raise DatasetError(f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}")
     files = _write_npz(out, plans, rate, kept) if to == "npz" else _write_each(out, plans, rate, kept, to)
-    return Exported(files, len(kept), refused)
+    invalid = tuple(index for index in kept if plans.status[index] == PlanStatus.INVALID)
+    return Exported(files, len(kept), refused, invalid)
 
 
 def _chosen(plans: Plans, only: Sequence[int] | None) -> list[int]:

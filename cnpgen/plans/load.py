@@ -84,7 +84,10 @@ def _read(path: Path, name: str, dataset: Any) -> NDArray[Any]:
     what, kinds = ("integers", "iu") if name in INTEGERS else ("floats", "f") if name in FLOATS else ("numbers", "fiu")
     if dataset.dtype.kind not in kinds:
         raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
-    return np.asarray(dataset[()], np.int64 if name in INTEGERS else np.float64)
+    values = dataset[()]
+    if dataset.dtype.kind == "u" and values.size and values.max() > np.iinfo(np.int64).max:
+        raise DatasetError(f"{path}: {name} must hold integers below 2^63, got {values.max()}")
+    return np.asarray(values, np.int64 if name in INTEGERS else np.float64)
 
 
 def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
 from cnpgen.plans.layout import FLOATS, INTEGERS
 from cnpgen.plans.problem import ProblemRecord, record_problem
@@ -128,10 +129,10 @@ def make_plans(
         boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
         rate_control_points=_floats("rate_control_points", rate_control_points),
-        degree=record.trajectory.degree if degree is None else degree,
+        degree=record.trajectory.degree if degree is None else integer("degree", degree, least=3),
         columns={name: _floats(name, values) for name, values in (columns or {}).items()},
-        sample_id=np.arange(rows) if sample_id is None else np.asarray(sample_id, np.int64),
-        status=np.zeros(rows, np.uint8) if status is None else np.asarray(status, np.uint8),
+        sample_id=np.arange(rows) if sample_id is None else _integers("sample_id", sample_id, np.int64),
+        status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
     )
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
@@ -185,6 +186,20 @@ def _floats(name: str, values: ArrayLike) -> Array:
         return np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
         raise UsageError(f"{name} must be an array of numbers with rows of equal length: {error}") from error
+
+
+def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:
+    """Return values as an array of integers of a kind, if they are such."""
+    try:
+        found = np.asarray(values)
+        whole = found.astype(kind)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"{name} must be an array of integers: {error}") from error
+    limits = np.iinfo(kind)
+    fits = found.size == 0 or (found.dtype.kind in "iu" and limits.min <= found.min() and found.max() <= limits.max)
+    if not fits:
+        raise UsageError(f"{name} must hold integers from {limits.min} to {limits.max}, got {found.dtype} {found!s:.60}")
+    return whole
 
 
 def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
@@ -259,7 +274,7 @@ def _rows(plans: Plans) -> int:
 
 def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
     for name, values in plans.columns.items():
-        if name in {*FLOATS, *INTEGERS} or "/" in name or not name:
+        if name in {*FLOATS, *INTEGERS} or "/" in name or name in {"", "."}:
             yield f"a column cannot be called {name!r}"
         if values.ndim not in {1, 2} or len(values) != rows:
             yield f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}"

@@ -70,13 +70,13 @@ class FineCheck:
         cost, g = motion.measured(x)
         bounds = self._bounds.of(task.start_xyz)
         with np.errstate(invalid="ignore"):
-            beyond = np.maximum(g - bounds.upper, bounds.lower - g)
-        ratio = beyond / np.maximum(self._bounds.allowed, ROUNDING)
+            ratio = bounds.excess(g) / np.maximum(self._bounds.allowed, ROUNDING)
         worst = float(ratio.max())
         if not np.isfinite(worst):
             return cost, Excess(np.inf, True, np.inf)
         high = ratio > 1
-        size = np.abs(np.where(high, g, 0.0)).max(axis=0, initial=0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = np.where(high, g / np.where(g > bounds.upper, bounds.upper, bounds.lower), 0.0).max(axis=0)
         speed, strength = (size[self._bounds.needs == needs].max(initial=1.0) for needs in (1, 2))
         return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), max(speed, float(np.sqrt(strength))))
 

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+from cnpgen.arguments import integer, number
 from cnpgen.errors import UsageError, nearest
 from cnpgen.refine import sqp
 from cnpgen.refine.criterion import OBJECTIVES
-from cnpgen.verdict.judge import check_step
 
+COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks
 SOLVERS = ("own", "ipopt", "sqpmethod")
 
 
@@ -22,7 +23,7 @@ class RefineOptions:
         max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down.
         tolerance: Relative change of the objective below which it has settled: what follows only makes it feasible.
             From nothing a tenth of it counts, among obstacles a twentieth.
-        step: The verdict looks at moments no further apart than this [s].
+        step: The verdict looks at moments no further apart than this [s], 1 ms at most.
 
     Raises:
         UsageError: A value makes no sense.
@@ -41,12 +42,12 @@ class RefineOptions:
                 raise UsageError(
                     f"{what} {value!r} does not exist: expected one of {', '.join(known)}{nearest(value, known)}"
                 )
-        if self.weight is not None and not 0 <= self.weight < float("inf"):
-            raise UsageError(f"the weight of an objective must be a number that is not negative, got {self.weight}")
-        if self.max_iterations < 0:
-            raise UsageError(f"max_iterations must not be negative, got {self.max_iterations}")
-        check_step(self.step)
-        if not 0 < self.tolerance < 1:
+        if self.weight is not None and number("weight", self.weight) < 0:
+            raise UsageError(f"the weight of an objective must not be negative, got {self.weight}")
+        integer("max_iterations", self.max_iterations, least=0)
+        if not 0 < number("step", self.step) <= COARSEST:
+            raise UsageError(f"the time step must be above 0 and at most {COARSEST:g} s, got {self.step:g} s")
+        if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
 
 

@@ -1,5 +1,6 @@
 """From attempts to a plan: the verdict of Pinocchio and Coal decides, and none comes back worse than it was given."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 
 PRECISE = 0.1  # of an equality's tolerance, beyond what the ends need: the optimiser's band is narrower
 SAME = 1e-12  # rad and 1/s: control points that differ by less are the same but for rounding
+GIVEN = {Outcome.KEPT, Outcome.ADJUSTED}
 HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless there is no better one
 
 
@@ -85,7 +87,7 @@ class _Search:
         """Judge a plan."""
         verdict = self.jury.verdict(self.task, path, rate)
         cost = self.refiner.check.transcription(self.task).objective(path, rate)
-        reached = outcome if verdict.valid or outcome is Outcome.KEPT else Outcome.UNSOLVED
+        reached = outcome if verdict.valid or outcome in GIVEN else Outcome.UNSOLVED
         refined = Refined(path, rate, reached, verdict.reason, 0, cost)
         return _Candidate(refined, _severity(verdict), self._is_precise(verdict))
 
@@ -96,6 +98,8 @@ class _Search:
 
     def _candidate(self, attempt: Attempt) -> _Candidate:
         path, rate = self.refiner.check.transcription(self.task).unpack(attempt.x)
+        if attempt.outcome is Outcome.ADJUSTED and _is_given(self.task, path, rate):
+            return self.weigh(path, rate, Outcome.KEPT)
         return self.weigh(path, rate, attempt.outcome)
 
 
@@ -115,24 +119,31 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
         if search.offer(attempt):
             break
     best = search.best()
-    for path, rate in _as_given(refiner, task, given):
+    for path, rate, outcome in _as_given(refiner, task, given):
         if search.may_be_better(path, rate, best.refined):
-            kept = search.weigh(path, rate, Outcome.KEPT)
+            kept = search.weigh(path, rate, outcome)
             best = min(best, kept, key=lambda each: each.rank)
+            if kept.refined.valid:
+                break
     return Refined(**{**vars(best.refined), "iterations": search.iterations})
 
 
-def _as_given(refiner: Refiner, task: Task, given: Array | None) -> list[tuple[Array, Array]]:
-    """Return the plan as it was given, where it can be evaluated: as it is, and with exact ends if it had others."""
-    plans = []
-    if task.path is not None and task.rate is not None and np.isfinite(task.path).all():
-        forward = Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]
-        plans += [(task.path, task.rate)] if forward else []
+def _as_given(refiner: Refiner, task: Task, given: Array | None) -> Iterator[tuple[Array, Array, Outcome]]:
+    """Yield the plan as it was given, where it can be evaluated: with exact ends if it had others, and as it is."""
     if given is not None:
         path, rate = refiner.check.transcription(task).unpack(given)
-        if not plans or np.abs(path - plans[0][0]).max() > SAME or np.abs(rate - plans[0][1]).max() > SAME:
-            plans.append((path, rate))
-    return plans
+        if not _is_given(task, path, rate):
+            yield path, rate, Outcome.ADJUSTED
+    if task.path is not None and task.rate is not None and np.isfinite(task.path).all():
+        if Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]:
+            yield task.path, task.rate, Outcome.KEPT
+
+
+def _is_given(task: Task, path: Array, rate: Array) -> bool:
+    """Whether a plan is the one that was given, but for rounding."""
+    assert task.path is not None
+    assert task.rate is not None
+    return bool(np.abs(path - task.path).max() <= SAME and np.abs(rate - task.rate).max() <= SAME)
 
 
 def _severity(verdict: Verdict) -> float:

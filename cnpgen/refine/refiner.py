@@ -155,7 +155,7 @@ class Refiner:
         if self.settings.max_iterations == 0:
             yield self._slowed_only(task, given)
             return
-        repaired = self._measured(task, given, Outcome.KEPT) if given is not None and task.at_rest else None
+        repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
         x = given if repaired is None else repaired.x
         first = self._first(task, x)
         if first.violation <= self.settings.violation_tolerance and not task.at_rest:
@@ -175,7 +175,7 @@ class Refiner:
             yield from self._from_others(task, x, strict if strict.is_better(best) else best)
 
     def _slowed_only(self, task: Task, given: Array | None) -> Attempt:
-        x, outcome = (self.straight(task), Outcome.SOLVED) if given is None else (given, Outcome.KEPT)
+        x, outcome = (self.straight(task), Outcome.SOLVED) if given is None else (given, Outcome.ADJUSTED)
         return self._measured(task, x, outcome, at_any_cost=True)
 
     def _from_others(self, task: Task, given: Array | None, best: Attempt) -> Iterator[Attempt]:

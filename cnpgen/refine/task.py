@@ -22,6 +22,7 @@ class Outcome(IntEnum):
     KEPT = 4
     UNSOLVED = 5
     UNUSABLE = 6
+    ADJUSTED = 7
 
     @property
     def text(self) -> str:
@@ -33,6 +34,7 @@ class Outcome(IntEnum):
             Outcome.RESTARTED: "solved from another start",
             Outcome.KEPT: "kept as it was given: nothing better was found",
             Outcome.UNSOLVED: "no valid plan was found; this is the best one",
+            Outcome.ADJUSTED: "kept as it was given but for its ends, made exact, and its rates, made positive",
             Outcome.UNUSABLE: "the boundary conditions are no numbers",
         }[self]
 

@@ -83,7 +83,8 @@ class Transcription:
         spec = stage.spec
         self.stage, self.spec, self.grid, self.boundary = stage, spec, grid, boundary
         self.n = boundary.start_q.shape[1]
-        self.interior = spec.path_control_points - 3 - boundary.fixed_at_goal
+        self._fixed = spec.path_control_points - boundary.fixed_at_goal  # where the goal's control points begin
+        self.interior = self._fixed - 3
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
         self.tops = tops
@@ -101,8 +102,7 @@ class Transcription:
 
     def pack(self, path: Array, rate: Array) -> Array:
         """Return the variables of a motion; its boundary control points are replaced by the exact ones."""
-        end = len(path) - self.boundary.fixed_at_goal
-        return np.concatenate([path[3:end].ravel(), np.log(rate)])
+        return np.concatenate([path[3 : self._fixed].ravel(), np.log(rate)])
 
     def value(self, x: Array) -> tuple[float, Array]:
         """Evaluate what is minimised, and residuals (K, m), without derivatives."""
@@ -215,8 +215,7 @@ class Transcription:
         n, m, orders = self.n, len(k), len(bases.path)
         control = bases.path_at[k] @ stage[:, : orders * n].reshape(m, orders, n)
         out = np.empty((m, self.nx))
-        end = self.spec.path_control_points - self.boundary.fixed_at_goal
-        out[:, : self.split] = control[:, 3:end].reshape(m, self.split)
+        out[:, : self.split] = control[:, 3 : self._fixed].reshape(m, self.split)
         out[:, self.split :] = (bases.rate_at[k] @ stage[:, orders * n :, None])[..., 0] * rate
         for each in self._slopes(rate):
             out[:, self.split + each.variable] += control[:, each.point] @ (each.slope[0] * rate[each.variable])

@@ -4,13 +4,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from cnpgen.robots.linalg import Scalar, dot
+from cnpgen.robots.linalg import Scalar, cross, dot
 from cnpgen.robots.symbolic import Vec
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
 ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one is needed
 TOUCHING = 1e-30  # m^2: the square root of less has no gradient
 FLAT = 1e-12  # m: what a segment's extent along an axis is taken for where it has none, so that there is 1 / extent
+PARALLEL = 1e-16  # m^2: a segment that is no further along an edge's normals is parallel to the edge
 POINT = 1e-12  # m^2: keeps a signed distance of nothing differentiable
 
 
@@ -34,8 +35,36 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
     return ca.sqrt(ca.fmax(sum(x * x for x in outside), TOUCHING)) - math.sqrt(TOUCHING)
 
 
+def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
+    """Signed distance of a segment from an axis-aligned box: minus the depth where they overlap [m].
+
+    The depth is the shortest way by which one must be moved to leave the other. The separating axes of the two are the
+    faces' normals, and normals of the segment and an edge.
+
+    Args:
+        first: One end [m].
+        second: Other end [m].
+        box: Bounds along x, y, z [m].
+    """
+    import casadi as ca
+
+    ends = [(high - ENDLESS if low is None else low, low + ENDLESS if high is None else high) for low, high in box]
+    middle, half = [(low + high) / 2 for low, high in ends], [(high - low) / 2 for low, high in ends]
+    along, place = ([b - a for a, b in zip(start, end, strict=True)] for start, end in ((first, second), (middle, first)))
+    separation: Scalar = -ENDLESS
+    for a, b, (low, high) in zip(first, second, ends, strict=True):
+        separation = ca.fmax(separation, ca.fmax(low - ca.fmax(a, b), ca.fmin(a, b) - high))
+    for axis in range(3):
+        normal = cross([float(i == axis) for i in range(3)], along)
+        square = dot(normal, normal)
+        reach = sum(extent * ca.fabs(x) for extent, x in zip(half, normal, strict=True))
+        apart = (ca.fabs(dot(normal, place)) - reach) / ca.sqrt(ca.fmax(square, PARALLEL))
+        separation = ca.fmax(separation, ca.if_else(square > PARALLEL, apart, -ENDLESS))
+    return segment_box_distance(first, second, box) + ca.fmin(separation, 0)
+
+
 def signed_segment_box_distance(first: Vec, second: Vec, box: Bounds, *, hold: Callable[[Scalar], Scalar]) -> Scalar:
-    """Distance from a segment to an axis-aligned box, negative where it is inside [m]: it has a gradient everywhere.
+    """Distance from a segment to an axis-aligned box, negative where it is inside [m]: it has no kink but on entering.
 
     Inside it is the depth, below the nearest face, of the middle of the part that is inside. Outside, the nearest point
     of the segment may be held while the distance is differentiated: it minimises the distance, so that to first order

@@ -52,7 +52,7 @@ def fit_motion(
     times, positions, velocities = checked_samples(t, q, dq)
     if boundary is None:
         boundary = sampled_boundary(times, positions, velocities)
-    _check_boundary(boundary, positions.shape[1])
+    boundary = _checked_boundary(boundary, positions.shape[1])
     fit = _Fit(*resampled(times - times[0], positions, velocities), times[-1] - times[0], spec, boundary)
     rates = [fit.mixed_rate(mixture) for mixture in MIXTURES]
     errors = [fit.error(rate) for rate in rates]
@@ -74,14 +74,20 @@ def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
     return float(np.abs(motion.at(motion.phase_at(times[None] - times[0])).q[0] - positions).max())
 
 
-def _check_boundary(boundary: Boundary, n: int) -> None:
+def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
+    """Return the boundary as arrays, if it is one of one motion."""
+    found: dict[str, Array | None] = {}
     for name, value in vars(boundary).items():
-        if value is None:
-            continue
-        if np.shape(value) != (1, n):
-            raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {np.shape(value)}")
-        if not np.isfinite(value).all():
-            raise UsageError(f"the boundary's {name} must be finite, got {value[0]}")
+        try:
+            found[name] = None if value is None else np.asarray(value, np.float64)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"the boundary's {name} must be an array of numbers: {error}") from error
+        row = found[name]
+        if row is not None and row.shape != (1, n):
+            raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}")
+        if row is not None and not np.isfinite(row).all():
+            raise UsageError(f"the boundary's {name} must be finite, got {row[0]}")
+    return Boundary(**found)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

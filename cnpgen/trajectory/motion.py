@@ -1,5 +1,6 @@
 """N motions of one robot: positions and their derivatives in time, duration, time as a function of phase."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.recipes import TrajectorySpec
-from cnpgen.trajectory.spline import basis, graded_edges, horner, lowest, pick, pieces
+from cnpgen.trajectory.spline import basis, edges_around, extremes, graded_edges, horner, pick, pieces
 
 Array = NDArray[np.float64]
 BLOCK = 16_384  # numbers
@@ -88,12 +89,14 @@ class Motion:
         forward: NDArray[np.bool_] = np.asarray(np.isfinite(self.rate).all(axis=1))
         in_doubt = forward & (self.rate <= 0).any(axis=1)  # a B-spline is between its control points
         for i in np.flatnonzero(in_doubt):
-            forward[i] = lowest(self.rate[i], self.degree) > 0
+            forward[i] = extremes(self.rate[i], self.degree)[1].min() > 0
         return forward
 
     def duration(self) -> Array:
         """Duration ``T = integral of 1 / r`` [s], shape (N,); inf where r is not positive, nan where not finite."""
-        total = self._times_at(*_quadrature(self.rate.shape[1], self.degree))[:, -1].copy()
+        total = np.empty(len(self))
+        for which, edges in self._cells():
+            total[which] = self[which]._times_at(edges, self._table(edges))[:, -1]
         total[~self.runs_forward()] = np.inf
         total[~np.isfinite(self.rate).all(axis=1)] = np.nan
         return total
@@ -107,9 +110,11 @@ class Motion:
         Returns:
             Shape (N, K); without meaning where r is not positive.
         """
-        edges = np.union1d(graded_edges(self.rate.shape[1], self.degree), s)
-        table = _nodes_of(edges, self.rate.shape[1], self.degree)
-        return self._times_at(edges, table)[:, np.searchsorted(edges, s)]
+        times = np.empty((len(self), len(s)))
+        for which, coarse in self._cells():
+            edges = np.union1d(coarse, s)
+            times[which] = self[which]._times_at(edges, self._table(edges))[:, np.searchsorted(edges, s)]
+        return times
 
     def _times_at(self, edges: Array, table: Array) -> Array:
         """Time at edges of cells, shape (N, edges), from the basis at their Gauss nodes, shape (R, cells x 8)."""
@@ -133,8 +138,14 @@ class Motion:
         blocks = self._blocks(len(_NODES) * t.shape[1])
         if len(blocks) > 1:
             return np.concatenate([self[block].phase_at(t[block]) for block in blocks])
-        edges, table = _quadrature(self.rate.shape[1], self.degree)
-        known = self._times_at(edges, table)
+        phases = np.empty(t.shape)
+        for which, edges in self._cells():
+            phases[which] = self[which]._phases_at(t[which], edges)
+        return phases
+
+    def _phases_at(self, t: Array, edges: Array) -> Array:
+        """Return what ``phase_at`` does, with a quadrature over cells between the edges."""
+        known = self._times_at(edges, self._table(edges))
         with np.errstate(all="ignore"):
             t = np.clip(t, 0.0, known[:, -1:])
             found = [np.searchsorted(row, times, side="right") for row, times in zip(known, t, strict=True)]
@@ -161,6 +172,27 @@ class Motion:
         """
         return Motion(self.path, self.rate / factor[:, None], self.degree)
 
+    def _cells(self) -> Iterator[tuple[slice | list[int], Array]]:
+        """Yield groups of motions and the edges of the cells that ``t(s)`` is integrated over for them.
+
+        They are the same for all motions but those whose r, though positive, has control points that are not: it may
+        turn close to 0.
+        """
+        shared = graded_edges(self.rate.shape[1], self.degree)
+        near_zero = np.isfinite(self.rate).all(axis=1) & (self.rate <= 0).any(axis=1)
+        if not near_zero.any():
+            yield slice(None), shared
+            return
+        yield np.flatnonzero(~near_zero).tolist(), shared
+        for i in np.flatnonzero(near_zero).tolist():
+            s, r = extremes(self.rate[i], self.degree)
+            yield [i], edges_around(s, len(self.rate[i]), self.degree) if r.min() > 0 else shared
+
+    def _table(self, edges: Array) -> Array:
+        """Return the basis of r at the Gauss nodes of the cells between the edges, shape (R, cells x 8)."""
+        points, degree = self.rate.shape[1], self.degree
+        return _shared_nodes(points, degree) if edges is graded_edges(points, degree) else _nodes(edges, points, degree)
+
     def _blocks(self, columns: int) -> list[slice]:
         """Split the motions so that arrays of shape (block, columns) stay in the cache."""
         size = max(BLOCK // max(columns, 1), 1)
@@ -168,13 +200,11 @@ class Motion:
 
 
 @cache
-def _quadrature(points: int, degree: int) -> tuple[Array, Array]:
-    """Return the edges of the cells that ``t(s)`` is integrated over, and the basis of r at their Gauss nodes."""
-    edges = graded_edges(points, degree)
-    return edges, _nodes_of(edges, points, degree)
+def _shared_nodes(points: int, degree: int) -> Array:
+    return _nodes(graded_edges(points, degree), points, degree)
 
 
-def _nodes_of(edges: Array, points: int, degree: int) -> Array:
+def _nodes(edges: Array, points: int, degree: int) -> Array:
     nodes = edges[:-1, None] + np.diff(edges)[:, None] * _NODES
     return basis(nodes.ravel(), points, degree).T
 

@@ -91,14 +91,14 @@ def horner(picked: Array, offset: Array, order: int = 0) -> Array:
     return value
 
 
-def lowest(control: Array, degree: int) -> float:
-    """Return the smallest value on [0, 1] of one spline of finite control points, shape (C,)."""
+def extremes(control: Array, degree: int) -> tuple[Array, Array]:
+    """Return where on [0, 1] one spline of finite control points, shape (C,), ends or turns, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
     spline = BSpline(clamped_knots(len(control), degree), control, degree)
     turning = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
-    s = np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]])
-    return float(spline(np.clip(s, 0, 1)).min())
+    s = np.clip(np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]]), 0, 1)
+    return s, np.asarray(spline(s))
 
 
 @dataclass(frozen=True)
@@ -143,3 +143,13 @@ def graded_edges(points: int, degree: int) -> Array:
     spans = points - degree
     end = 0.5 ** np.arange(24, 2, -1)
     return np.unique(np.concatenate([np.linspace(0, spans, 4 * spans + 1), end, spans - end])) / spans
+
+
+def edges_around(s: Array, points: int, degree: int) -> Array:
+    """Return the edges of ``graded_edges`` and, between them, those of cells that shrink towards phases s, shape (K,).
+
+    They are for an r that turns close to 0 between its ends.
+    """
+    away = np.concatenate([[0.0], 0.5 ** np.arange(26, 2, -1)]) / (points - degree)
+    close = np.concatenate([s[:, None] - away, s[:, None] + away], axis=None)
+    return np.union1d(graded_edges(points, degree), close[(close > 0) & (close < 1)])

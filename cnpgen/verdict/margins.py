@@ -12,7 +12,7 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.verdict.course import Course
 from cnpgen.verdict.parts import name_part
 from cnpgen.verdict.sampling import Samples
-from cnpgen.verdict.verdict import Margin, Reason
+from cnpgen.verdict.verdict import NOTHING, Margin, Reason
 from cnpgen.verify.path import PathWorld
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ BOUNDARY = {
     "dq": ("boundary velocity", "rad/s", 1e-6),
     "ddq": ("boundary acceleration", "rad/s^2", 1e-4),
 }
-_TINY = 1e-200  # stands for an allowed excess of 0, so that the largest excess can still be found
 
 
 def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:
@@ -103,7 +102,7 @@ def measure_condition(
     below, above = condition.lower[:, None] - g, g - condition.upper[:, None]
     excess = np.maximum(below, above) - wider
     allowed = constraint.allowed(condition)
-    share = excess / np.maximum(allowed, _TINY)[:, None]  # argmax finds the first that is nan, if any is
+    share = excess / np.maximum(allowed, NOTHING)[:, None]  # argmax finds the first that is nan, if any is
     part, k = divmod(int(np.argmax(share)), len(samples.s))
     is_low = below[part, k] > above[part, k]
     worst = float(excess[part, k])

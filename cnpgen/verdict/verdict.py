@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
+NOTHING = 1e-200  # stands for an allowed excess of 0, so that the largest excess can still be found
+
 
 class Reason(StrEnum):
     """Why a plan is not valid; one that breaks a constraint has the constraint's own ``reason``."""
@@ -53,9 +55,7 @@ class Margin:
     @property
     def severity(self) -> float:
         """Excess in multiples of what is allowed: above 1 is not valid."""
-        if self.allowed > 0:
-            return self.excess / self.allowed
-        return math.copysign(math.inf, self.excess) if self.excess else 0.0
+        return self.excess / max(self.allowed, NOTHING)
 
     def __str__(self) -> str:
         name = f"{self.name} {self.part}".strip()

@@ -135,7 +135,7 @@ class PathWorld:
         return velocity, np.array(pin.getFrameClassicalAcceleration(model, data, tip, frame).linear)
 
     def segment_distances(self) -> list[Array]:
-        """Measure how far every segment of the robot's skeleton is from every obstacle, segment by segment [m].
+        """Measure the signed distance of every segment of the robot's skeleton from every obstacle, one by one [m].
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
@@ -145,7 +145,7 @@ class PathWorld:
         if not np.all(np.isfinite(segments)):
             return self._unknown(len(ends))
         corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
-        bounds = [np.maximum(gaps(low, high, box), 0.0) for low, high in corners for box in boxes]
+        bounds = [gaps(low, high, box) for low, high in corners for box in boxes]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             a, b = ends[pair][0][..., k].tolist()

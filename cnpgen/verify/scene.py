@@ -68,7 +68,7 @@ class Scene:
             place.setTranslation(np.array([x, y, top - height / 2]))
 
     def segment_distances(self, segments: Sequence[tuple[Point, Point]]) -> list[float]:
-        """Measure the distance of every segment from every obstacle, segment by segment [m]; 0 where they meet.
+        """Measure the signed distance of every segment from every obstacle, segment by segment [m].
 
         Args:
             segments: Both ends of each segment [m].
@@ -76,11 +76,11 @@ class Scene:
         distances: list[float] = []
         for index, (a, b) in enumerate(segments):
             self._place_segment(index, a, b)
-            distances += [max(distance, 0.0) for distance in self._measure(self._from_capsule[index])]
+            distances += self._measure(self._from_capsule[index])
         return distances
 
     def segment_apart(self, a: Point, b: Point, obstacle: int) -> tuple[float, Array]:
-        """Measure the distance of one segment from one obstacle.
+        """Measure the signed distance of one segment from one obstacle.
 
         Args:
             a: One end of the segment [m].
@@ -88,12 +88,11 @@ class Scene:
             obstacle: Index of the obstacle.
 
         Returns:
-            The distance [m], 0 where they meet, and the unit vector of shape (3,) along which they are apart, from the
+            The distance [m], minus the depth where they overlap, and the unit vector of shape (3,) along which they are apart, from the
             obstacle to the segment.
         """
         self._place_segment(0, a, b)
-        distance, direction = self._apart(self._from_capsule[0], obstacle)
-        return max(distance, 0.0), direction
+        return self._apart(self._from_capsule[0], obstacle)
 
     def _place_segment(self, index: int, a: Point, b: Point) -> None:
         (ax, ay, az), (bx, by, bz) = a, b
