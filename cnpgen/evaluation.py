@@ -15,6 +15,7 @@ from cnpgen.plans.problem import open_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.verdict import Reason, Verdict, judge, summarise
 from cnpgen.verdict.judge import check_step
+from cnpgen.wording import counted
 from cnpgen.workers import share_out, worker_count
 
 FORMAT = "cnpgen-evaluation"
@@ -43,6 +44,10 @@ class Evaluation:
     plans: Plans
     verdicts: tuple[Verdict, ...]
     step: float
+
+    def __repr__(self) -> str:
+        plans = f"{counted(len(self.verdicts), 'plan')} of {self.plans.problem.name!r}"
+        return f"<{plans} judged, {int(self.valid.sum()):,} valid>"
 
     @property
     def valid(self) -> NDArray[np.bool_]:

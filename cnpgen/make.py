@@ -90,7 +90,7 @@ def make_dataset(
         seed: Root seed; default the recipe's.
         workers: Processes; default one per available core, or one where so few rows are missing that a second would
             not pay.
-        shard_size: Rows per shard; default between 8192 and 65536, of certified datasets between 512 and 1024.
+        shard_size: Rows per shard; default between 8192 and 65536, of certified datasets between 64 and 1024.
         dtype: "float64" or "float32", what rows are stored as and validated as.
         backend: "compiled", "numpy" or "casadi"; default the fastest that works.
         certify: Whether to plan every sample and keep those with a valid plan, with the plan (about 30 ms a sample).

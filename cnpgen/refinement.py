@@ -120,7 +120,7 @@ def refine_plans(
     finally:
         if notes is not None:
             notes.close()
-    return _assembled(plans, [done[i] for i in range(len(plans))])
+    return _assembled(plans, [done[i] for i in range(len(plans))], options)
 
 
 def _run(
@@ -147,7 +147,7 @@ def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[l
         return part, refine_part(plans, options)
 
 
-def _assembled(given: Plans, refined: list[Refined]) -> Refinement:
+def _assembled(given: Plans, refined: list[Refined], options: RefineOptions) -> Refinement:
     """Put the refined plans together; beside them how they ended."""
     if not refined:
         return Refinement(given, given, ())
@@ -156,6 +156,7 @@ def _assembled(given: Plans, refined: list[Refined]) -> Refinement:
         path_control_points=np.stack([each.path for each in refined]),
         rate_control_points=np.stack([each.rate for each in refined]),
         columns={**given.columns, **_columns(refined)},
+        refined_with=json.dumps({"cnpgen": __version__, **asdict(options)}),
     )
     valid, screened = np.array([each.valid for each in refined]), screen(plans)
     status = np.where(valid, PlanStatus.VALID, np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened))

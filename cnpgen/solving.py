@@ -1,4 +1,7 @@
-"""Problems to solve: rows of a dataset, or fresh draws of a recipe, as plans that are still to be made."""
+"""Problems to solve: rows of a dataset, or fresh draws of a recipe, as plans that are still to be made.
+
+Rows of a certified dataset have their plans already.
+"""
 
 import json
 from pathlib import Path
@@ -25,30 +28,33 @@ Array = NDArray[np.float64]
 SPLIT = "(fresh draws)"  # no split can be called so: no row of any dataset is among them
 
 
-def problems_of_rows(problem: ProblemRecord, columns: "Mapping[str, Array]") -> Plans:
-    """Return rows of a dataset as plans whose control points are nan.
+def problems_of_rows(problem: ProblemRecord, columns: "Mapping[str, Array]", *, source: str = "") -> Plans:
+    """Return rows of a dataset as plans: with those of a certified dataset, else with control points of nan.
 
     Args:
         problem: Their problem.
         columns: Field -> values, shape (N,) or (N, w), as shards hold them.
+        source: Where they are from.
     """
     spec = problem.trajectory
     rows, n = columns["start_q"].shape
     names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")
     boundary = Boundary(*(np.asarray(columns[name], float) for name in names if name in columns))
     kept = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
+    path, rate = (columns.get(f"{part}_control_points", np.array(np.nan)) for part in ("path", "rate"))
     return make_plans(
         problem,
         boundary,
-        path_control_points=np.full((rows, spec.path_control_points, n), np.nan),
-        rate_control_points=np.full((rows, spec.rate_control_points), np.nan),
+        path_control_points=np.broadcast_to(path, (rows, spec.path_control_points * n)).reshape(rows, -1, n),
+        rate_control_points=np.broadcast_to(rate, (rows, spec.rate_control_points)),
         columns={name: columns[name] for name in kept if name in columns},
         sample_id=columns.get("sample_id"),
+        source=source,
     )
 
 
 def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n: int | None = None) -> Plans:
-    """Read rows of a dataset as plans that are still to be made.
+    """Read rows of a dataset as plans that are still to be made; those of a certified dataset have the stored plans.
 
     Args:
         folder: The dataset.
@@ -72,7 +78,8 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
     if not 0 <= start < stop <= rows:
         wanted = f"{stop - start} from row {start} on"
         raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}")
-    return problems_of_rows(_problem_of(dataset.plan), dataset.read(split, start=start, stop=stop))
+    source = f"dataset {dataset.plan.name}, seed {dataset.plan.seed}, split {split}"
+    return problems_of_rows(_problem_of(dataset.plan), dataset.read(split, start=start, stop=stop), source=source)
 
 
 def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
@@ -105,7 +112,8 @@ def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | Non
     for field in prepared.fields:
         values = np.concatenate([part[field.name] for part in parts], axis=1).T
         columns[field.name] = np.ascontiguousarray(values if field.width else values[:, 0])
-    return problems_of_rows(record_problem(loaded.pipeline.problem), columns)
+    source = f"fresh draws of {loaded.name}, seed {root}"
+    return problems_of_rows(record_problem(loaded.pipeline.problem), columns, source=source)
 
 
 def _problem_of(plan: "DatasetPlan") -> ProblemRecord:

@@ -13,14 +13,16 @@ import pytest
 from cnpgen.certification import NO_PLAN, CertifiedPlan, PlanCheck, certified, check_plans
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
+from cnpgen.evaluation import evaluate_plans
 from cnpgen.library import load_dataset_recipe
 from cnpgen.make import make_dataset
+from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.problem import record_problem
 from cnpgen.refine import polish
 from cnpgen.refine.task import Refined
 from cnpgen.refinement import refine_plans
 from cnpgen.robots.robot import load_robot
-from cnpgen.solving import problems_of_rows
+from cnpgen.solving import load_problems, problems_of_rows
 from cnpgen.store.files import file_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.validation import validate_dataset
@@ -51,8 +53,20 @@ def test_every_row_holds_a_plan_that_deep_validation_judges(folder: Path) -> Non
 def test_the_plans_are_those_that_solve_finds(folder: Path) -> None:
     problem = load_dataset_recipe("airhockey-hit").pipeline.problem
     rows = open_dataset(folder).read("validation")
-    found = refine_plans(problems_of_rows(record_problem(problem), rows)).plans
+    unsolved = {name: values for name, values in rows.items() if not name.endswith("control_points")}
+    found = refine_plans(problems_of_rows(record_problem(problem), unsolved)).plans
     np.testing.assert_array_equal(found.path_control_points.reshape(len(found), -1), rows["path_control_points"])
+
+
+def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(folder: Path, tmp_path: Path) -> None:
+    plans = load_problems(folder)
+    assert evaluate_plans(plans, workers=1).valid.all()
+    np.testing.assert_allclose(plans.duration, open_dataset(folder).read("train")["duration"], rtol=1e-12)
+    found = refine_plans(plans, workers=1)
+    assert found.valid.all()
+    assert (found.plans.duration <= plans.duration * (1 + 2e-3)).all()
+    save_plans(tmp_path / "stored.h5", plans)
+    assert load_plans(tmp_path / "stored.h5").source == "dataset airhockey-hit-certified, seed 20261121, split train"
 
 
 def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) -> None:
@@ -93,7 +107,13 @@ def test_a_plan_that_does_not_hold_is_found(folder: Path, tmp_path: Path) -> Non
     assert check_plans(problem, robot, {"start_q": rows["start_q"]}) == PlanCheck()
 
 
-def test_float32_is_refused_since_plans_would_miss_their_ends(tmp_path: Path) -> None:
+def test_float32_is_refused_since_plans_would_miss_their_ends(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["make-dataset", "airhockey-hit", "-o", str(tmp_path / "out"), "--certify", "--dtype", "float32"]) == 2
+    assert capsys.readouterr().err == (
+        "cnpgen: error: --certify stores plans, which are exact in float64 only: leave out --dtype float32\n"
+    )
     with pytest.raises(RecipeError, match="float64"):
         make_dataset("airhockey-hit", tmp_path / "out", n=4, certify=True, dtype="float32")
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from example_plans import load
 from plan_files import garbage, plans_of
+from test_plans import draw_plans
 
 from cnpgen.cli.export_command import FORMS
 from cnpgen.cli.main import main
 from cnpgen.export import FORMS as LIBRARY_FORMS
-from cnpgen.plans import save_plans
+from cnpgen.plans import PlanStatus, save_plans
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -97,6 +99,23 @@ def test_a_plan_that_is_not_there_is_named_before_the_place_is_looked_at(run: Ru
     assert run(hits, "--to", "joint-trajectory", "--plan", 0)[0] == 0  # elsewhere
     code, _, err = run(hits, "--to", "csv", "--plan", "0,7")
     assert (code, err) == (2, "cnpgen: error: there is no plan 7: 4 plans are numbered from 0\n")
+
+
+def test_plans_that_are_known_not_to_be_valid_are_exported_with_a_warning(run: Run, tmp_path: Path) -> None:
+    plans = draw_plans(n=14)
+    status = np.where(np.arange(14) == 3, PlanStatus.VALID, PlanStatus.INVALID).astype(np.uint8)
+    save_plans(tmp_path / "bad.h5", replace(plans, status=status))
+    code, _, err = run(tmp_path / "bad.h5", "--to", "npz", "--rate", 50)
+    text = "not valid by their status ('cnpgen evaluate' says why): plans 0, 1, 2, 4, 5, 6, 7, 8, 9, 10 and 3 more"
+    assert (code, err.splitlines()[0]) == (0, f"cnpgen: warning: {text}")
+    _, _, err = run(tmp_path / "bad.h5", "--to", "npz", "--rate", 50, "--plan", "3", "--force")
+    assert "warning" not in err
+
+
+def test_a_place_in_a_folder_that_does_not_exist_is_refused(run: Run, hits: Path) -> None:
+    code, _, err = run(hits, "--to", "npz", "-o", "no/where.npz")
+    assert (code, err) == (2, f"cnpgen: error: {Path('no/where.npz')} must be in a folder that exists\n")
+    assert not Path("no").exists()
 
 
 def test_an_empty_folder_is_free(run: Run, hits: Path) -> None:

@@ -211,7 +211,7 @@ def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
     assert load_plans(beside).problem.name == "heavy-object"
     assert load_plans(beside, problem="heavy-object").problem.digest == record_problem(HEAVY).digest
     assert load_plans(unsaid, problem=HEAVY).problem == record_problem(HEAVY)
-    with pytest.raises(DatasetError, match=r"b\.h5 does not say its problem: set the attribute 'problem', or pass"):
+    with pytest.raises(DatasetError, match=r"b\.h5 does not say its problem: set its attribute 'problem'"):
         load_plans(unsaid)
 
 
@@ -289,7 +289,7 @@ def test_another_robot_file_is_another_problem() -> None:
         ({"start_q": np.zeros((3, 6), complex)}, "start_q must hold floats, got complex128"),
         ({"start_q": np.full((3, 6), b"x")}, r"start_q must hold floats, got \|S1"),
         ({"sample_id": np.zeros(3)}, "sample_id must hold integers, got float64"),
-        ({"sample_id": np.full(3, 2**63, np.uint64)}, r"sample_id must hold integers below 2\^63, got 9223372036854775808"),
+        ({"sample_id": np.full(3, 2**63, np.uint64)}, r"sample_id must hold integers below 2\^63, got 9223372036854"),
         ({"names": np.array([b"a", b"b", b"c"])}, "names must hold numbers"),
         (
             {"attributes": {"problem": "airhokey"}},
@@ -532,6 +532,21 @@ def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(name: 
         make_plans(plans.problem, others, **points)
     with pytest.raises(UsageError, match=f"{name} must be an array of numbers with rows of equal length"):
         make_plans(plans.problem, replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}), **points)
+
+
+def test_where_plans_are_from_is_kept_in_the_file(tmp_path: Path) -> None:
+    plans = replace(draw_plans(), source="my trainer, seed 3", refined_with='{"solver": "own"}')
+    save_plans(tmp_path / "a.h5", plans)
+    found = load_plans(tmp_path / "a.h5")
+    assert (found.source, found.refined_with) == (plans.source, plans.refined_with)
+    with pytest.raises(UsageError, match="source must be a text, got 3"):
+        replace(plans, source=3)  # type: ignore[arg-type]
+
+
+def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(tmp_path: Path) -> None:
+    path = write_minimal(tmp_path / "a.h5", attributes={"problem_sha256": "0" * 64})
+    with pytest.raises(DatasetError, match="is of another 'airhockey': its problem_sha256 is not this one's"):
+        load_plans(path)
 
 
 @pytest.mark.parametrize(

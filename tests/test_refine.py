@@ -1,13 +1,17 @@
 """The refiner: exact derivatives, plans that the independent verdict calls valid, honest outcomes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from example_plans import PROBLEMS, Plan, load, raised
 from example_refiner import library, refine, refiner, refiner_of, task, tops, verdict
 
+from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import UsageError
+from cnpgen.kernels.library import KernelLibrary
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.refine import sqp
 from cnpgen.refine.bounds import Bounds
@@ -17,11 +21,12 @@ from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.quadratic import Model, choose
-from cnpgen.refine.refiner import Pass
+from cnpgen.refine.refiner import Pass, Refiner
 from cnpgen.refine.sqp import Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.refine.transcription import Stage, Transcription
+from cnpgen.robots.symbolic import SymbolicState
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import chebyshev
@@ -115,7 +120,7 @@ def test_objectives_are_chosen_by_name_and_nonsense_is_refused() -> None:
         RefineOptions(objective="effort", weight=-1.0)
     with pytest.raises(UsageError, match="tolerance must be between 0 and 1, got 0"):
         RefineOptions(tolerance=0)
-    with pytest.raises(UsageError, match="max_iterations must be an integer from 0 on, got 2.5"):
+    with pytest.raises(UsageError, match=r"max_iterations must be an integer from 0 on, got 2\.5"):
         RefineOptions(max_iterations=2.5)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"the time step must be above 0 and at most 0\.001 s, got 0\.01 s"):
         RefineOptions(step=0.01)
@@ -442,3 +447,41 @@ def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radiu
     again = model.solve(held, np.full(motion.nx, radius), warm=step.multipliers)
     np.testing.assert_allclose(again.dx, step.dx, atol=1e-6)
     assert model.solve(held, np.full(motion.nx, radius), relax=True).left <= step.left + 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class TipSpeed(Constraint):
+    """A plug-in's constraint whose residual is no fraction of a limit: the square of the tip's speed."""
+
+    reason = "tip too fast"
+    tolerance: float = 1e-3
+    highest: float = 1.0
+
+    def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
+        return self._slow(state.tip_velocity)
+
+    def measured(self, world: World) -> tuple[Condition, ...]:
+        return self._slow(world.tip_velocity)
+
+    def _slow(self, velocity: Any) -> tuple[Condition, ...]:
+        square = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
+        bounds = np.array([-np.inf]), np.array([self.highest**2])
+        return (Condition("tip speed", "m^2/s^2", [square], *bounds, "velocity", needs=1),)
+
+
+def test_a_slow_down_is_as_large_as_the_bound_asks_for_whatever_its_size(tmp_path: Path) -> None:
+    plan = load("transport")
+    states = plan.motion.at(np.linspace(0, 1, 500))
+    world, fastest = World(plan.problem, plan.robot), 0.0
+    for state in zip(states.q[0], states.dq[0], states.ddq[0], strict=True):
+        world.set_state(*state, tops(plan))
+        fastest = max(fastest, float(np.linalg.norm(world.tip_velocity)))
+    limit = TipSpeed(highest=fastest / 1.05)
+    problem = replace(plan.problem, constraint=(*plan.problem.constraint, limit))
+    kernels = KernelLibrary("numpy", tmp_path, problem.digest, {"robot": plan.robot, "problem": problem})
+    world = World(problem, plan.robot)
+    tool = Refiner(problem, plan.robot, kernels=kernels, world=world, settings=Settings(max_iterations=0))
+    jury = Jury(problem, plan.robot, degree=7)
+    found = refine_task(tool, jury, task(plan, path=plan.motion.path[0], rate=plan.motion.rate[0]))
+    assert (found.outcome, found.reason) == (Outcome.SLOWED, "ok")
+    assert 1.04 < duration(found) / plan.motion.duration()[0] < 1.2

@@ -170,6 +170,18 @@ def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
     assert (nothing.valid, nothing.iterations) == (False, 0)
 
 
+def test_a_plan_whose_objective_still_fell_when_the_steps_were_used_up_says_so(problems: Plans) -> None:
+    few = problems.select(slice(0, 4))
+    found = refine_plans(few, options=RefineOptions(objective="jerk", max_iterations=25), workers=1)
+    settled = refine_plans(found.plans, options=RefineOptions(objective="jerk", max_iterations=400), workers=1)
+    by_outcome = {outcome: [i for i in range(4) if found.refined[i].outcome is outcome] for outcome in Outcome}
+    assert by_outcome[Outcome.UNSETTLED]
+    for i in by_outcome[Outcome.UNSETTLED]:
+        assert found.refined[i].valid
+        assert settled.refined[i].cost < found.refined[i].cost
+    assert {each.outcome for each in settled.refined} <= {Outcome.SOLVED, Outcome.POLISHED}
+
+
 def test_a_valid_plan_whose_rate_has_a_negative_control_point_is_no_worse_afterwards(tmp_path: Path) -> None:
     plan = refine_plans(draw_problems("heavy-object", 1, seed=5)).plans
     rate = 0.6 * plan.rate_control_points

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.interpolate import BSpline
 
+from cnpgen.errors import UsageError
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.motion import Motion, States
@@ -114,6 +115,25 @@ def test_slowing_down_from_rest_to_rest_is_exact(factor: float) -> None:
         boundary, motion.path[:, 3:-3], slow.rate, spec
     )  # the boundary points for the new rate are the same
     assert np.abs(again - slow.path).max() < 1e-14
+
+
+def test_phases_and_times_are_one_row_for_all_motions_or_one_each() -> None:
+    motion = draw_motion(4, n=5)
+    t = np.linspace(0, 0.3, 9)
+    s = motion.phase_at(t)
+    assert s.shape == (5, 9)
+    np.testing.assert_array_equal(s, motion.phase_at(np.tile(t, (5, 1))))
+    np.testing.assert_allclose(motion.time_at(s), np.tile(t, (5, 1)), atol=1e-13)
+    np.testing.assert_allclose(motion.time_at(s[2])[2], t, atol=1e-13)
+    ends = np.stack([np.zeros(5), motion.duration()], axis=1)
+    np.testing.assert_array_equal(motion.time_at(np.array([-1.0, 2.0])), ends)
+    np.testing.assert_array_equal(motion.at([0.0, 0.5]).q, motion.at(np.array([0.0, 0.5])).q)
+    np.testing.assert_array_equal(motion[3].path, motion.path[[3]])
+    np.testing.assert_array_equal(motion.slower(2.0).rate, motion.rate / 2)
+    for method, what in ((motion.at, "phases"), (motion.time_at, "phases"), (motion.phase_at, "times")):
+        for wrong in (0.5, np.full((1, 4), 0.5), np.full((3, 4), 0.5), np.zeros((5, 2, 2))):
+            with pytest.raises(UsageError, match=rf"{what} must have shape \(K,\) or \(5, K\), got"):
+                method(wrong)
 
 
 def test_motions_that_stop_or_go_back_last_for_ever() -> None:

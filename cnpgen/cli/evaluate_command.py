@@ -117,4 +117,4 @@ def _chosen(found: "Evaluation") -> int:
 
 
 def _said(verdict: "Verdict") -> str:
-    return "valid" if verdict.valid else f"{verdict.reason} ({verdict.worst})"
+    return "valid" if verdict.valid else verdict.reason + (f" ({verdict.worst})" if verdict.worst else "")

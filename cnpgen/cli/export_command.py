@@ -35,10 +35,10 @@ def add(commands: "Commands[Parser]") -> None:
         "--out",
         metavar="PATH",
         type=Path,
-        help="file (npz) or folder to write; default: named after FILE and FORM",
+        help="file (npz) or folder to write; default: in the current folder, named after FILE and FORM",
     )
     option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
-    option("--sample", metavar="I", type=values.numbers, help="the plans of these samples only, by sample_id")
+    option("--sample", metavar="I", type=values.numbers, help="these samples' plans only, by sample_id; adds to --plan")
     option("--force", action="store_true", help="replace files that are there")
 
 
@@ -78,6 +78,8 @@ def _place(arguments: argparse.Namespace) -> Path:
 
     file: Path = arguments.file
     out: Path = arguments.out or Path(f"{file.stem}.npz" if arguments.to == "npz" else f"{file.stem}-{arguments.to}")
+    if not out.parent.is_dir():
+        raise UsageError(f"{out} must be in a folder that exists")
     target = out / "plans.npz" if arguments.to == "npz" and out.is_dir() else out
     if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
         raise UsageError(f"{target} is there already; --force replaces what has the same name")

@@ -41,7 +41,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
     option("--n", metavar="N", type=values.rows, help="rows of all splits together; default the recipe's")
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
-    option("--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
+    option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option(
         "--shard-size",
@@ -63,6 +63,7 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.recipe_names import check_recipe
+    from cnpgen.errors import UsageError
     from cnpgen.library import load_dataset_recipe
 
     check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' goes on with it")
@@ -70,6 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.certify:
         from cnpgen.certification import certified
 
+        if arguments.dtype == "float32":
+            raise UsageError("--certify stores plans, which are exact in float64 only: leave out --dtype float32")
         recipe = certified(recipe)
     if arguments.dry_run:
         from cnpgen.cli.plan_text import plan_text

@@ -21,7 +21,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "refine", run, title="polish the plans of a file", text=_TEXT)
     parser.add_argument("file", metavar="FILE", type=Path, help="a file of plans, .h5")
-    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help="where to (default: FILE-refined.h5)")
+    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help="where to (default: FILE-refined.h5 beside it)")
     parser.add_argument(
         "--problem", metavar="NAME|FILE", help="the problem that they must be for; its tolerances count"
     )

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 _TEXT = (
     """\
-A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds.
+A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds. Rows of a
+certified dataset have plans already: these are refined.
 """
     + TEXT
 )
@@ -30,7 +31,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--split", metavar="NAME", help="which split of the folder (default: validation)")
     option("--first", metavar="I", type=values.natural, help="the first row of the split (default: 0)")
     option("--seed", metavar="S", type=values.seed, help="root seed of fresh draws; default the recipe's")
-    option("-o", "--out", metavar="OUT", type=Path, help="where to (default: DIR-plans.h5 or NAME-plans.h5)")
+    option("-o", "--out", metavar="OUT", type=Path, help="where to (default: DIR-plans.h5 or NAME-plans.h5 here)")
     add_options(parser)
 
 

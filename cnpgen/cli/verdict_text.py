@@ -61,12 +61,14 @@ def _figure(form: str, value: float) -> str:
 
 def _why(verdict: "Verdict", step: float) -> str:
     """Say what decided, as far as there is more to say than the reason."""
+    from cnpgen.verdict.judge import LONGEST_STEP
     from cnpgen.verdict.sampling import LONGEST
     from cnpgen.verdict.verdict import Reason
 
     if verdict.reason == Reason.TOO_LONG:
         time = f"{verdict.metrics.duration:.3g} s"
-        return f"{time} are more than {LONGEST:,} steps of {1e3 * step:g} ms; with a longer --step it is looked at"
+        text = f"{time} are more than {LONGEST:,} steps of {1e3 * step:g} ms"
+        return text + ("; with a longer --step it is looked at" if step < LONGEST_STEP else "")
     return str(verdict.worst or "")
 
 

@@ -12,6 +12,7 @@ REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
 FLOATS = (*REQUIRED, "goal_ddq", "duration")
 INTEGERS = ("sample_id", "status")
+NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
 _UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "xyz": "m"}
@@ -22,6 +23,9 @@ _OTHERS = (
     Field("duration", "s", "integral of 1 / r(s)", role="diagnostic"),
     Field("sample_id", "1", "index of the sample in its split", role="diagnostic"),
     Field("status", "1", "what is known of the plan", role="diagnostic"),
+    Field("refine_outcome", "1", "how refining ended", role="diagnostic"),
+    Field("refine_iterations", "1", "steps of all attempts together", role="diagnostic"),
+    Field("refine_objective", "s", "what was minimised: time and what is added to it", role="diagnostic"),
     Field("hit_angle", "rad", "direction of the hit about world z, from world x", role="context", frame="world"),
     Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
 )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.library import load_problem
-from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, REQUIRED
+from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
@@ -49,7 +49,7 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
     if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
         raise DatasetError(f"{path} is {kind}, not a file of plans")
     with opened_foreign_hdf5(path) as file:
-        attributes = {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
+        attributes = {name: file.attrs[name] for name in (*ATTRIBUTES, *NOTES) if name in file.attrs}
         _check_format(path, attributes)
         columns = _columns(path, file)
     record = _record(path, attributes, wanted)
@@ -122,7 +122,8 @@ def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | N
     """Find out which problem the plans are for."""
     found = stored_problem(path, attributes) or wanted
     if found is None:
-        raise DatasetError(f"{path} does not say its problem: set the attribute 'problem', or pass problem=...")
+        help_ = "set its attribute 'problem' to a name or a file, or pass problem=... (--problem of 'evaluate')"
+        raise DatasetError(f"{path} does not say its problem: {help_}")
     if wanted is not None and found.digest != wanted.digest:
         where = ", ".join(found.differences(wanted)[:4])
         raise DatasetError(
@@ -147,9 +148,12 @@ def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord |
         return None
     name = _text(path, attributes, "problem")
     try:
-        return record_problem(load_problem(name, relative_to=path.parent))
+        record = record_problem(load_problem(name, relative_to=path.parent))
     except RecipeError as error:
         raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
+    if "problem_sha256" in attributes and _text(path, attributes, "problem_sha256") != record.digest:
+        raise DatasetError(f"{path} is of another {name!r}: its problem_sha256 is not this one's, {record.digest}")
+    return record
 
 
 def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
@@ -187,7 +191,9 @@ def _assembled(
     if duration is not None and duration.shape != (len(plans),):
         raise UsageError(f"duration must have shape {(len(plans),)}, got {duration.shape}")
     stored = {name: values for name, values in plans.columns.items() if name in columns}
-    return replace(plans, columns={**plans.columns, **_tips(path, plans, stored)})
+    source, options = (_text(path, attributes, name) if name in attributes else "" for name in NOTES)
+    columns = {**plans.columns, **_tips(path, plans, stored)}
+    return replace(plans, columns=columns, source=source, refined_with=options)
 
 
 def _tips(path: Path, plans: Plans, stored: Mapping[str, Array]) -> dict[str, Array]:

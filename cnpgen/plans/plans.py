@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
-from cnpgen.plans.layout import FLOATS, INTEGERS
+from cnpgen.plans.layout import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
@@ -37,6 +37,8 @@ class Plans:
             ``make_plans`` and ``load_plans``.
         sample_id: Which sample of a dataset every plan is for, shape (N,).
         status: What is known of every plan, values of ``PlanStatus``, shape (N,).
+        source: Where they are from, a line of text, or nothing.
+        refined_with: The options that they were refined with, as JSON, or nothing.
     """
 
     problem: ProblemRecord
@@ -47,6 +49,8 @@ class Plans:
     columns: Mapping[str, Array] = field(default_factory=dict)
     sample_id: NDArray[np.int64]
     status: NDArray[np.uint8]
+    source: str = ""
+    refined_with: str = ""
 
     def __post_init__(self) -> None:
         mistake = next(_mistakes(self), None)
@@ -103,6 +107,7 @@ def make_plans(
     columns: Mapping[str, ArrayLike] | None = None,
     sample_id: ArrayLike | None = None,
     status: ArrayLike | None = None,
+    source: str = "",
 ) -> Plans:
     """Put plans together; what is not given is computed.
 
@@ -116,6 +121,7 @@ def make_plans(
             they are given, and then they must be that.
         sample_id: Shape (N,); 0, 1, ... by default.
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
+        source: Where they are from, a line of text.
 
     Raises:
         UsageError: Something has the wrong shape.
@@ -133,6 +139,7 @@ def make_plans(
         columns={name: _floats(name, values) for name, values in (columns or {}).items()},
         sample_id=np.arange(rows) if sample_id is None else _integers("sample_id", sample_id, np.int64),
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
+        source=source,
     )
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
@@ -195,10 +202,9 @@ def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDAr
         whole = found.astype(kind)
     except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"{name} must be an array of integers: {error}") from error
-    limits = np.iinfo(kind)
-    fits = found.size == 0 or (found.dtype.kind in "iu" and limits.min <= found.min() and found.max() <= limits.max)
-    if not fits:
-        raise UsageError(f"{name} must hold integers from {limits.min} to {limits.max}, got {found.dtype} {found!s:.60}")
+    low, high = np.iinfo(kind).min, np.iinfo(kind).max
+    if found.size and not (found.dtype.kind in "iu" and low <= found.min() and found.max() <= high):
+        raise UsageError(f"{name} must hold integers from {low} to {high}, got {found.dtype} {found!s:.60}")
     return whole
 
 
@@ -262,6 +268,9 @@ def _mistakes(plans: Plans) -> Iterator[str]:
         if getattr(plans, name).shape != (rows,):
             yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
     yield from _column_mistakes(plans, rows)
+    for name in NOTES:
+        if not isinstance(getattr(plans, name), str):
+            yield f"{name} must be a text, got {getattr(plans, name)!r:.60}"
 
 
 def _rows(plans: Plans) -> int:

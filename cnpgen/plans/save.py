@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, plan_fields
+from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, NOTES, plan_fields
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files import write_file
@@ -82,6 +82,7 @@ def _attributes(plans: Plans) -> dict[str, str | int]:
         "problem_recipe": record.recipe,
         "problem_urdf": record.urdf,
         "problem_sha256": record.digest,
+        **{name: getattr(plans, name) for name in NOTES},
     }
 
 

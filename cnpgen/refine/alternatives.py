@@ -70,7 +70,7 @@ def _rounds(motion: Transcription, watch: "_Watch", x: Array, *, solver: str) ->
         options = _options(solver, programme, settings, limit - steps, warm=warm)
         end, multipliers, taken = _run(programme, watch, end, multipliers, options, solver=solver)
         steps += taken
-    return Result(watch.x, watch.cost, watch.violation, steps)
+    return Result(watch.x, watch.cost, watch.violation, steps, steps < limit)
 
 
 @dataclass

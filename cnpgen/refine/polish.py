@@ -134,9 +134,10 @@ def _as_given(refiner: Refiner, task: Task, given: Array | None) -> Iterator[tup
         path, rate = refiner.check.transcription(task).unpack(given)
         if not _is_given(task, path, rate):
             yield path, rate, Outcome.ADJUSTED
-    if task.path is not None and task.rate is not None and np.isfinite(task.path).all():
-        if Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]:
-            yield task.path, task.rate, Outcome.KEPT
+    if task.path is None or task.rate is None or not np.isfinite(task.path).all():
+        return
+    if Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]:
+        yield task.path, task.rate, Outcome.KEPT
 
 
 def _is_given(task: Task, path: Array, rate: Array) -> bool:

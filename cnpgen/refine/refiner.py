@@ -159,10 +159,12 @@ class Refiner:
         x = given if repaired is None else repaired.x
         first = self._first(task, x)
         if first.violation <= self.settings.violation_tolerance and not task.at_rest:
-            yield Attempt(first.x, 0.0, first.cost, Outcome.SOLVED, first.iterations)  # most are; no need to measure
+            outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
+            yield Attempt(first.x, 0.0, first.cost, outcome, first.iterations)  # most are valid; no need to measure
             best = self._measured(task, first.x, Outcome.SOLVED)
         else:
-            best = self._measured(task, first.x, Outcome.SOLVED, first.iterations)
+            outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
+            best = self._measured(task, first.x, outcome, first.iterations)
             yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED)
         yield polished

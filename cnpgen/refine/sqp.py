@@ -73,12 +73,14 @@ class Result:
         cost: Objective there.
         violation: Worst scaled violation there.
         iterations: Steps tried.
+        ended: Whether nothing was left to gain, rather than no step.
     """
 
     x: Array
     cost: float
     violation: float
     iterations: int
+    ended: bool
 
 
 def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings) -> Result:
@@ -95,7 +97,7 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
     while iteration < settings.max_iterations and not descent.ended:
         iteration += 1
         descent.advance()
-    return Result(descent.x, descent.cost, descent.violation, iteration)
+    return Result(descent.x, descent.cost, descent.violation, iteration, descent.ended)
 
 
 class _Descent:

@@ -50,7 +50,8 @@ def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
 
     ends = [(high - ENDLESS if low is None else low, low + ENDLESS if high is None else high) for low, high in box]
     middle, half = [(low + high) / 2 for low, high in ends], [(high - low) / 2 for low, high in ends]
-    along, place = ([b - a for a, b in zip(start, end, strict=True)] for start, end in ((first, second), (middle, first)))
+    along = [b - a for a, b in zip(first, second, strict=True)]
+    place = [a - m for a, m in zip(first, middle, strict=True)]
     separation: Scalar = -ENDLESS
     for a, b, (low, high) in zip(first, second, ends, strict=True):
         separation = ca.fmax(separation, ca.fmax(low - ca.fmax(a, b), ca.fmin(a, b) - high))

@@ -13,8 +13,8 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, MachineError
 
 _HINTS = {
-    errno.ENOSPC: "free some space and run the same command again: what is finished is kept",
-    errno.EDQUOT: "your quota is used up; free some space and run the same command again: what is finished is kept",
+    errno.ENOSPC: "free some space and run the same command again",
+    errno.EDQUOT: "your quota is used up; free some space and run the same command again",
     errno.EFBIG: "the file is larger than this system or session allows (see ulimit -f)",
     errno.EROFS: "the file system is read-only; choose another folder",
     errno.EACCES: "choose a folder that you may write to",

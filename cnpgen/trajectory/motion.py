@@ -6,8 +6,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.spline import basis, edges_around, extremes, graded_edges, horner, pick, pieces
 
@@ -53,7 +54,8 @@ class Motion:
     def __len__(self) -> int:
         return len(self.path)
 
-    def __getitem__(self, index: slice | list[int] | NDArray[Any]) -> "Motion":
+    def __getitem__(self, index: int | slice | list[int] | NDArray[Any]) -> "Motion":
+        index = [int(index)] if isinstance(index, int | np.integer) else index
         return Motion(self.path[index], self.rate[index], self.degree)
 
     @property
@@ -70,7 +72,11 @@ class Motion:
 
         Args:
             s: Phases in [0, 1], shape (K,), the same for all motions, or (N, K).
+
+        Raises:
+            UsageError: s has another shape.
         """
+        s = self._moments("phases", s)
         blocks = self._blocks(s.shape[1]) if s.ndim == 2 else []
         if len(blocks) > 1:
             parts = [vars(self[block].at(s[block])) for block in blocks]
@@ -105,11 +111,17 @@ class Motion:
         """Time at phases s, ``t(s) = integral of 1 / r from 0 to s`` [s].
 
         Args:
-            s: Ascending phases, shape (K,), s[0] >= 0.
+            s: Phases in [0, 1], shape (K,), the same for all motions, or (N, K).
 
         Returns:
             Shape (N, K); without meaning where r is not positive.
+
+        Raises:
+            UsageError: s has another shape.
         """
+        s = np.clip(self._moments("phases", s), 0.0, 1.0)
+        if s.ndim == 2:
+            return np.concatenate([self[[i]].time_at(s[i]) for i in range(len(self))]).reshape(s.shape)
         times = np.empty((len(self), len(s)))
         for which, coarse in self._cells():
             edges = np.union1d(coarse, s)
@@ -130,11 +142,16 @@ class Motion:
         """Phase at times t: the inverse of ``time_at``, by Newton's method within the cells of its quadrature.
 
         Args:
-            t: Times in [0, T] [s], shape (N, K); clipped to the motion.
+            t: Times in [0, T] [s], shape (K,), the same for all motions, or (N, K); clipped to the motion.
 
         Returns:
             Shape (N, K), exactly 0 and 1 at the ends; without meaning where r is not positive.
+
+        Raises:
+            UsageError: t has another shape.
         """
+        t = self._moments("times", t)
+        t = np.repeat(t[None], len(self), axis=0) if t.ndim == 1 else t
         blocks = self._blocks(len(_NODES) * t.shape[1])
         if len(blocks) > 1:
             return np.concatenate([self[block].phase_at(t[block]) for block in blocks])
@@ -165,12 +182,22 @@ class Motion:
                     break
         return np.where(t >= known[:, -1:], 1.0, low + ahead)
 
-    def slower(self, factor: Array) -> "Motion":
-        """Slow the motions down uniformly: the path stays, the rate is divided by ``factor`` (shape (N,), at least 1).
+    def slower(self, factor: Array | float) -> "Motion":
+        """Slow the motions down uniformly: the path stays, the rate is divided by ``factor``.
 
         Exact for motions from rest to rest: their boundary velocities and accelerations stay zero.
+
+        Args:
+            factor: At least 1: one for each, shape (N,), or one for all.
         """
-        return Motion(self.path, self.rate / factor[:, None], self.degree)
+        return Motion(self.path, self.rate / np.reshape(factor, (-1, 1)), self.degree)
+
+    def _moments(self, what: str, values: ArrayLike) -> Array:
+        """Return phases or times as an array of shape (K,) or (N, K)."""
+        found = np.asarray(values, np.float64)
+        if found.ndim not in {1, 2} or (found.ndim == 2 and len(found) != len(self)):
+            raise UsageError(f"{what} must have shape (K,) or ({len(self)}, K), got {found.shape}")
+        return found
 
     def _cells(self) -> Iterator[tuple[slice | list[int], Array]]:
         """Yield groups of motions and the edges of the cells that ``t(s)`` is integrated over for them.

@@ -88,8 +88,8 @@ class Scene:
             obstacle: Index of the obstacle.
 
         Returns:
-            The distance [m], minus the depth where they overlap, and the unit vector of shape (3,) along which they are apart, from the
-            obstacle to the segment.
+            The distance [m], minus the depth where they overlap, and the unit vector of shape (3,) along which they are
+            apart, from the obstacle to the segment.
         """
         self._place_segment(0, a, b)
         return self._apart(self._from_capsule[0], obstacle)
