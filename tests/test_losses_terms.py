@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from example_losses import huber
 from example_plans import PROBLEMS, ROBOTS
-from test_symbolic import HIGH, LOW, box_bounds, coal_segment_distance, segments
+from test_symbolic import HIGH, LOW, box_bounds, coal_segment_separation, segments
 
 from cnpgen.constraints.constraint import Condition
 from cnpgen.kernels.interpreted import InterpretedGridKernel

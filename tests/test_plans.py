@@ -486,6 +486,9 @@ def test_selected_plans_joined_again_are_the_same() -> None:
     assert_equal(joined, plans)
     assert_equal(concatenate([plans.select(slice(0, 2)), plans.select(slice(2, None))]), plans)
     assert_equal(concatenate([plans]), plans)
+    parts = [replace(plans, source=source, refined_with="{}") for source in ("a", "", "b", "a")]
+    assert (concatenate(parts).source, concatenate(parts).refined_with) == ("a; b", "{}")
+    assert not concatenate([plans, *parts]).refined_with
     assert plans.select(np.array([3, 3, 0])).sample_id.tolist() == [103, 103, 100]
 
 

@@ -163,8 +163,11 @@ def concatenate(parts: Sequence[Plans]) -> Plans:
         None if first_part is None else np.concatenate([getattr(part.boundary, name) for part in parts])
         for name, first_part in vars(first.boundary).items()
     ]
+    sources, options = (list(dict.fromkeys(getattr(part, name) for part in parts)) for name in NOTES)
     return replace(
         first,
+        source="; ".join(filter(None, sources)),
+        refined_with=options[0] if len(options) == 1 else "",
         boundary=Boundary(*joined),  # type: ignore[arg-type]
         path_control_points=np.concatenate([part.path_control_points for part in parts]),
         rate_control_points=np.concatenate([part.rate_control_points for part in parts]),

@@ -65,7 +65,7 @@ class FineCheck:
         return self._last(task)
 
     def measure(self, task: Task, x: Array) -> tuple[float, Excess]:
-        """Return the objective and the excess of a motion."""
+        """Return the objective [s] and the excess of a motion, whose variables are x of shape (nx,)."""
         motion = self.transcription(task)
         cost, g = motion.measured(x)
         bounds = self._bounds.of(task.start_xyz)

@@ -190,7 +190,7 @@ class Refiner:
             yield self._slowed(task, best, at_any_cost=True)
 
     def minimise(self, task: Task, which: Pass, x: Array) -> Result:
-        """Run one pass from x."""
+        """Run one pass from variables x, shape (nx,)."""
         settings, motion = which.settings, self.transcription(task, which)
         ends = motion.end_residuals()
         bounds = self.bounds(task, which, ends)

@@ -14,15 +14,20 @@ SHORTEST = 0.3  # s: first guess of the duration of motions between neighbouring
 def straight(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
     """The line between the boundary control points at a constant rate.
 
+    Args:
+        boundary: Boundary conditions of one motion.
+        velocity_limit: Of every joint [rad/s], shape (n,).
+        spec: Degree and numbers of control points.
+
     Returns:
-        ``(interior control points (m, n), rate control points (R,))``.
+        ``(path, rate)``: interior path control points [rad], shape (m, n), and rate control points [1/s], shape (R,).
     """
     rate = _constant_rate(boundary, velocity_limit, spec)
     return anchor_line(boundary, rate[None], spec)[0], rate
 
 
 def through(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec, *, middle: Array) -> tuple[Array, Array]:
-    """The same, bent towards a configuration half way."""
+    """The same as ``straight``, bent half way towards a configuration ``middle`` [rad], shape (n,)."""
     interior, rate = straight(boundary, velocity_limit, spec)
     if not len(interior):  # the ends alone decide where a motion of so few control points goes
         return interior, rate
@@ -33,7 +38,7 @@ def through(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec, *, 
 
 
 def smooth(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
-    """Control points fitted to the quintic polynomial of the boundary conditions."""
+    """The same as ``straight``, but with a path fitted to the quintic polynomial of the boundary conditions."""
     rate = _constant_rate(boundary, velocity_limit, spec)
     duration = 1.0 / rate[0]
     s = np.linspace(0, 1, 4 * spec.path_control_points)

@@ -57,11 +57,11 @@ def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array
 
     Args:
         boundary: Boundary conditions.
-        rate: Rate control points, shape (N, R), positive.
+        rate: Rate control points [1/s], shape (N, R), positive.
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, 3, n).
+        Shape (N, 3, n), in rad.
 
     Raises:
         UsageError: Boundary conditions of different numbers of joints are mixed.
@@ -77,11 +77,11 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
     Args:
         boundary: Boundary conditions.
-        rate: Rate control points, shape (N, R), positive.
+        rate: Rate control points [1/s], shape (N, R), positive.
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, 2 or 3, n).
+        Shape (N, 2 or 3, n), in rad.
 
     Raises:
         UsageError: Boundary conditions of different numbers of joints are mixed.
@@ -133,12 +133,15 @@ def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectoryS
 
     Args:
         boundary: Boundary conditions.
-        interior: Interior path control points, shape (N, C - 3 - N_d, n).
-        rate: Rate control points, shape (N, R).
+        interior: Interior path control points [rad], shape (N, C - 3 - N_d, n).
+        rate: Rate control points [1/s], shape (N, R), positive.
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, C, n).
+        Shape (N, C, n), in rad.
+
+    Raises:
+        UsageError: Boundary conditions of different numbers of joints are mixed, or C is below degree + 2.
     """
     return np.concatenate([start_points(boundary, rate, spec), interior, goal_points(boundary, rate, spec)], axis=1)
 
@@ -146,8 +149,16 @@ def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectoryS
 def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     """Interior control points on the line from C_2 to C_{C - N_d} (paper, eq. of the configuration points).
 
+    Args:
+        boundary: Boundary conditions.
+        rate: Rate control points [1/s], shape (N, R), positive.
+        spec: Degree and numbers of control points.
+
     Returns:
-        Shape (N, C - 3 - N_d, n).
+        Shape (N, C - 3 - N_d, n), in rad.
+
+    Raises:
+        UsageError: As of ``assemble``.
     """
     first, last = start_points(boundary, rate, spec)[:, 2:3], goal_points(boundary, rate, spec)[:, :1]
     count = spec.path_control_points - 3 - boundary.fixed_at_goal
