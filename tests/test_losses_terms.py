@@ -49,7 +49,7 @@ def ends_of(kind: str) -> Array:
 @pytest.mark.parametrize("kind", ["random", "parallel to an edge", "touching the top", "of no length"])
 def test_outside_the_signed_distance_is_that_of_coal(signed, kind):
     for ends in ends_of(kind):
-        expected = coal_segment_distance(ends[:3], ends[3:])
+        expected = coal_segment_separation(ends[:3], ends[3:])
         found = float(signed["distance"](ends))
         assert found == pytest.approx(expected, abs=2e-6) if expected > 1e-6 else found <= 2e-6
 
