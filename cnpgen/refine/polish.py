@@ -76,17 +76,13 @@ class _Search:
             self.judged.append(self._candidate(min(self.hopeless, key=lambda each: (each.excess, each.cost))))
         return min(self.judged, key=lambda each: (each.severity, not each.precise, each.refined.cost))
 
-    def may_be_better(self, path: Array, rate: Array, best: Refined) -> bool:
+    def may_be_better(self, path: Array, rate: Array, cost: float, best: Refined) -> bool:
         """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted."""
-        if not best.valid:
-            return True
-        cost = self.refiner.check.transcription(self.task).objective(path, rate)
-        return cost <= best.cost and not self.jury.refutes(self.task, path, rate)
+        return not best.valid or (cost <= best.cost and not self.jury.refutes(self.task, path, rate))
 
-    def weigh(self, path: Array, rate: Array, outcome: Outcome) -> _Candidate:
-        """Judge a plan."""
+    def weigh(self, path: Array, rate: Array, cost: float, outcome: Outcome) -> _Candidate:
+        """Judge a plan whose objective is ``cost``."""
         verdict = self.jury.verdict(self.task, path, rate)
-        cost = self.refiner.check.transcription(self.task).objective(path, rate)
         reached = outcome if verdict.valid or outcome in GIVEN else Outcome.UNSOLVED
         refined = Refined(path, rate, reached, verdict.reason, 0, cost)
         return _Candidate(refined, _severity(verdict), self._is_precise(verdict))
@@ -99,8 +95,8 @@ class _Search:
     def _candidate(self, attempt: Attempt) -> _Candidate:
         path, rate = self.refiner.check.transcription(self.task).unpack(attempt.x)
         if attempt.outcome is Outcome.ADJUSTED and _is_given(self.task, path, rate):
-            return self.weigh(path, rate, Outcome.KEPT)
-        return self.weigh(path, rate, attempt.outcome)
+            return self.weigh(path, rate, attempt.cost, Outcome.KEPT)
+        return self.weigh(path, rate, attempt.cost, attempt.outcome)
 
 
 @np.errstate(all="ignore")  # boundary conditions may be so large that squares of them are no numbers
@@ -120,8 +116,9 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
             break
     best = search.best()
     for path, rate, outcome in _as_given(refiner, task, given):
-        if search.may_be_better(path, rate, best.refined):
-            kept = search.weigh(path, rate, outcome)
+        cost = refiner.check.transcription(task).objective(path, rate)
+        if search.may_be_better(path, rate, cost, best.refined):
+            kept = search.weigh(path, rate, cost, outcome)
             best = min(best, kept, key=lambda each: each.rank)
             if kept.refined.valid:
                 break

@@ -160,7 +160,8 @@ class Refiner:
         first = self._first(task, x)
         if first.violation <= self.settings.violation_tolerance and not task.at_rest:
             outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
-            yield Attempt(first.x, 0.0, first.cost, outcome, first.iterations)  # most are valid; no need to measure
+            cost = first.cost - self.check.transcription(task).gauge(first.x)
+            yield Attempt(first.x, 0.0, cost, outcome, first.iterations)  # most are valid; no need to measure
             best = self._measured(task, first.x, Outcome.SOLVED)
         else:
             outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED

@@ -107,8 +107,12 @@ class Transcription:
     def value(self, x: Array) -> tuple[float, Array]:
         """Evaluate what is minimised, and residuals (K, m), without derivatives."""
         cost, g = self.measured(x)
+        return cost + self.gauge(x), g
+
+    def gauge(self, x: Array) -> float:
+        """Return what is minimised beside the objective, since it fixes the gauge between p and r."""
         log = x[self.split :]
-        return float(cost + 0.5 * log @ self._smooth @ log), g
+        return float(0.5 * log @ self._smooth @ log)
 
     def measured(self, x: Array) -> tuple[float, Array]:
         """Evaluate ``objective`` and residuals (K, m)."""

@@ -5,6 +5,7 @@ control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or dist
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,9 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline import basis
 from cnpgen.verdict.closer import keep_worse, look_closer
-from cnpgen.verdict.course import course, jerks
+from cnpgen.verdict.course import Course, course, jerks
 from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
 from cnpgen.verdict.sampling import Samples, sample, time_table
@@ -186,13 +188,25 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     if not plan.is_finite() or not plan.motion.runs_forward()[0]:
         return True
     samples = Samples(_GLANCE, _GLANCE)
-    states = course(plan.motion, samples.s)
+    states = _glance(plan.motion)
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
     if not all(margin.ok for margin in constraint_margins(plan.problem, world, samples)):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
+
+
+def _glance(motion: Motion) -> Course:
+    """Evaluate one motion where ``_GLANCE`` looks."""
+    p, p1, p2 = (each @ motion.path[0] for each in _bases(motion.path.shape[1], motion.degree))
+    r, r1, _ = (each @ motion.rate[0, :, None] for each in _bases(motion.rate.shape[1], motion.degree))
+    return Course(p.T, (p1 * r).T, ((p2 * r + p1 * r1) * r).T)
+
+
+@cache
+def _bases(points: int, degree: int) -> tuple[Array, ...]:
+    return tuple(basis(_GLANCE, points, degree, order) for order in range(3))
 
 
 def _samples(plan: _Plan, step: float) -> Samples | Verdict:
