@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.plans.plans import Plans
+from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.problem import open_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.verdict import Reason, Verdict, judge, summarise
@@ -92,10 +92,11 @@ def evaluate_plans(
         progress: Called with the number of plans that were judged since the last call.
 
     Raises:
-        UsageError: The step is not positive, or there are fewer than one worker.
+        UsageError: There are no plans, the step is not positive, or there are fewer than one worker.
         RecipeError: The problem needs a plug-in that is not installed.
         MachineError: A worker died.
     """
+    check_plans_type(plans)
     check_step(step)
     parts = [plans.select(slice(first, first + PART)) for first in range(0, len(plans), PART)]
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, len(parts))

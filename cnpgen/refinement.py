@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen import __version__
-from cnpgen.plans.plans import Plans, screen
+from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.engine import prepare, refine_part
 from cnpgen.refine.journal import Journal, open_journal
@@ -108,6 +108,7 @@ def refine_plans(
         RecipeError: The problem needs a plug-in that is not installed.
         MachineError: A worker died, or the journal cannot be written.
     """
+    check_plans_type(plans)
     notes = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
     done: dict[int, Refined] = {} if notes is None else dict(notes.finished)
     if begin is not None:

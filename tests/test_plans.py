@@ -19,6 +19,8 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
+from cnpgen.evaluation import evaluate_plans
+from cnpgen.export import export_plans
 from cnpgen.library import load_problem
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.plans import (
@@ -33,6 +35,7 @@ from cnpgen.plans import (
     screen,
 )
 from cnpgen.recipes import resolved
+from cnpgen.refinement import refine_plans
 from cnpgen.robots.robot import load_robot
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 
@@ -535,6 +538,18 @@ def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(name: 
         make_plans(plans.problem, others, **points)
     with pytest.raises(UsageError, match=f"{name} must be an array of numbers with rows of equal length"):
         make_plans(plans.problem, replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}), **points)
+
+
+def test_what_is_not_plans_is_refused_by_name(tmp_path: Path) -> None:
+    calls: list[Callable[[Any], Any]] = [
+        evaluate_plans,
+        refine_plans,
+        lambda plans: export_plans(plans, tmp_path / "a.npz", to="npz"),
+        lambda plans: save_plans(tmp_path / "a.h5", plans),
+    ]
+    for call in calls:
+        with pytest.raises(UsageError, match=r"expected Plans, as load_plans and make_plans return them, got str"):
+            call("plans.h5")
 
 
 def test_where_plans_are_from_is_kept_in_the_file(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from cnpgen.export.csv_table import csv_table
 from cnpgen.export.joint_trajectory import joint_trajectory
 from cnpgen.export.npz import write_npz
 from cnpgen.export.sampled import Sampled, sample_plan
-from cnpgen.plans.plans import Plans, screen
+from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files import write_file
 
@@ -66,6 +66,7 @@ def export_plans(
         DatasetError: None of the plans can be exported.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
+    check_plans_type(plans)
     if to not in FORMS:
         raise UsageError(f"plans can be exported to {', '.join(FORMS)}, got {to!r}")
     if not 0 < rate <= HIGHEST_RATE:

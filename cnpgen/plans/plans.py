@@ -146,6 +146,16 @@ def make_plans(
     return replace(plans, columns={**plans.columns, **missing})
 
 
+def check_plans_type(plans: Any) -> None:
+    """Refuse what is not ``Plans``: the name of a file, for example.
+
+    Raises:
+        UsageError: It is something else.
+    """
+    if not isinstance(plans, Plans):
+        raise UsageError(f"expected Plans, as load_plans and make_plans return them, got {type(plans).__name__}")
+
+
 def concatenate(parts: Sequence[Plans]) -> Plans:
     """Join plans of the same problem that have the same control points and columns.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, NOTES, plan_fields
-from cnpgen.plans.plans import Plans
+from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files import write_file
 from cnpgen.store.kinds import PLANS, file_kind
@@ -26,11 +26,12 @@ def save_plans(path: str | Path, plans: Plans) -> None:
         plans: The plans.
 
     Raises:
-        UsageError: Something else than a file of plans is there.
+        UsageError: Something else than a file of plans is there, or ``plans`` are none.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
     import h5py
 
+    check_plans_type(plans)
     check_replaceable(Path(path))
     buffer = io.BytesIO()
     fields = plan_fields(plans.problem.joint_names)
