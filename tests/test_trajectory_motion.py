@@ -136,6 +136,21 @@ def test_phases_and_times_are_one_row_for_all_motions_or_one_each() -> None:
                 method(wrong)
 
 
+@pytest.mark.parametrize(
+    ("path", "rate", "message"),
+    [
+        ((3, 15, 2), (4, 20), r"shapes \(N, C, n\) and \(N, R\), got \(3, 15, 2\) and \(4, 20\)"),
+        ((15, 2), (1, 20), r"got \(15, 2\) and \(1, 20\)"),
+        ((1, 15, 2), (20,), r"got \(1, 15, 2\) and \(20,\)"),
+        ((1, 15, 2), (1, 7), "splines of degree 7 need at least 8 control points"),
+        ((1, 7, 2), (1, 20), "splines of degree 7 need at least 8 control points"),
+    ],
+)
+def test_control_points_that_are_no_motion_are_refused(path: tuple[int], rate: tuple[int], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Motion(np.zeros(path), np.ones(rate))
+
+
 def test_motions_that_stop_or_go_back_last_for_ever() -> None:
     rate = np.ones((7, 20))
     rate[1] = 0

@@ -45,11 +45,21 @@ class Motion:
         path: Control points of p [rad], shape (N, C, n).
         rate: Control points of r [1/s], shape (N, R).
         degree: Degree of both splines.
+
+    Raises:
+        UsageError: The shapes do not fit together.
     """
 
     path: Array
     rate: Array
     degree: int = 7
+
+    def __post_init__(self) -> None:
+        path, rate = np.shape(self.path), np.shape(self.rate)
+        if len(path) != 3 or len(rate) != 2 or path[0] != rate[0]:
+            raise UsageError(f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}")
+        if min(path[1], rate[1]) <= self.degree:
+            raise UsageError(f"splines of degree {self.degree} need at least {self.degree + 1} control points")
 
     def __len__(self) -> int:
         return len(self.path)

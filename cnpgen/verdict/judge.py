@@ -158,8 +158,6 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
         if np.shape(values) != shape or len(shape) < 2:
             found = np.shape(values)
             raise UsageError(f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {found}")
-    if min(motion.path.shape[1], motion.rate.shape[1]) <= motion.degree:
-        raise UsageError(f"splines of degree {motion.degree} need at least {motion.degree + 1} control points")
 
 
 def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
