@@ -1,10 +1,11 @@
-"""What functions are given from Python: whole numbers within bounds, finite numbers, yes or no."""
+"""What functions are given from Python: whole numbers within bounds, finite numbers, arrays of them, yes or no."""
 
 import math
 import operator
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 
@@ -45,6 +46,18 @@ def number(name: str, value: Any) -> float:
     if not math.isfinite(found):
         raise UsageError(f"{name} must be a finite number, got {value!r:.100}")
     return found
+
+
+def numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return an argument as an array of floats, nan and inf included.
+
+    Raises:
+        UsageError: It holds something else, or rows of different lengths.
+    """
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name} must be an array of numbers: {error}") from error
 
 
 def flag(name: str, value: Any) -> bool:

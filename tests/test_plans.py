@@ -561,6 +561,11 @@ def test_where_plans_are_from_is_kept_in_the_file(tmp_path: Path) -> None:
         replace(plans, source=3)  # type: ignore[arg-type]
 
 
+def test_a_column_may_hold_integers_of_any_size(tmp_path: Path) -> None:
+    path = write_minimal(tmp_path / "a.h5", key=np.array([0, 1, 2**63], np.uint64))
+    assert load_plans(path).columns["key"].tolist() == [0.0, 1.0, 2.0**63]
+
+
 def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(tmp_path: Path) -> None:
     path = write_minimal(tmp_path / "a.h5", attributes={"problem_sha256": "0" * 64})
     with pytest.raises(DatasetError, match="is of another 'airhockey': its problem_sha256 is not this one's"):

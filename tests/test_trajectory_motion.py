@@ -128,6 +128,7 @@ def test_phases_and_times_are_one_row_for_all_motions_or_one_each() -> None:
     ends = np.stack([np.zeros(5), motion.duration()], axis=1)
     np.testing.assert_array_equal(motion.time_at(np.array([-1.0, 2.0])), ends)
     np.testing.assert_array_equal(motion.at([0.0, 0.5]).q, motion.at(np.array([0.0, 0.5])).q)
+    assert motion[:0].time_at(np.zeros((0, 4))).shape == (0, 4)
     np.testing.assert_array_equal(motion[3].path, motion.path[[3]])
     np.testing.assert_array_equal(motion.slower(2.0).rate, motion.rate / 2)
     for method, what in ((motion.at, "phases"), (motion.time_at, "phases"), (motion.phase_at, "times")):

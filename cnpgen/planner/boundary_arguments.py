@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arguments import numbers
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import Boundary
 
@@ -49,10 +50,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
 
 
 def _rows(name: str, values: ArrayLike, n: int) -> Array:
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers: {error}") from error
+    array = numbers(name, values)
     if array.ndim not in {1, 2} or array.shape[-1] != n:
         raise UsageError(f"{name} must have shape ({n},) or (N, {n}), got {array.shape}")
     rows = array.reshape(-1, n)

@@ -85,9 +85,11 @@ def _read(path: Path, name: str, dataset: Any) -> NDArray[Any]:
     if dataset.dtype.kind not in kinds:
         raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
     values = dataset[()]
-    if dataset.dtype.kind == "u" and values.size and values.max() > np.iinfo(np.int64).max:
+    if name not in INTEGERS:
+        return np.asarray(values, np.float64)
+    if values.size and values.max() > np.iinfo(np.int64).max:
         raise DatasetError(f"{path}: {name} must hold integers below 2^63, got {values.max()}")
-    return np.asarray(values, np.int64 if name in INTEGERS else np.float64)
+    return np.asarray(values, np.int64)
 
 
 def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:

@@ -53,6 +53,7 @@ class Plans:
     refined_with: str = ""
 
     def __post_init__(self) -> None:
+        integer("degree", self.degree, least=3)
         mistake = next(_mistakes(self), None)
         if mistake:
             raise UsageError(mistake)
@@ -135,7 +136,7 @@ def make_plans(
         boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
         rate_control_points=_floats("rate_control_points", rate_control_points),
-        degree=record.trajectory.degree if degree is None else integer("degree", degree, least=3),
+        degree=record.trajectory.degree if degree is None else degree,
         columns={name: _floats(name, values) for name, values in (columns or {}).items()},
         sample_id=np.arange(rows) if sample_id is None else _integers("sample_id", sample_id, np.int64),
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
@@ -267,8 +268,6 @@ def _mistakes(plans: Plans) -> Iterator[str]:
     joints = len(plans.problem.joint_names)
     if n != joints:
         yield f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}"
-    if degree < 3:
-        yield f"the degree must be at least 3, got {degree}"
     fewest = max(degree + 2, 3 + plans.boundary.fixed_at_goal)
     if points < fewest:
         yield f"path_control_points must have at least {fewest} of degree {degree}, got shape {path.shape}"

@@ -6,6 +6,7 @@ from cnpgen.arguments import integer, number
 from cnpgen.errors import UsageError, nearest
 from cnpgen.refine import sqp
 from cnpgen.refine.criterion import OBJECTIVES
+from cnpgen.verdict.judge import check_step
 
 COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks
 SOLVERS = ("own", "ipopt", "sqpmethod")
@@ -45,8 +46,7 @@ class RefineOptions:
         if self.weight is not None and number("weight", self.weight) < 0:
             raise UsageError(f"the weight of an objective must not be negative, got {self.weight}")
         integer("max_iterations", self.max_iterations, least=0)
-        if not 0 < number("step", self.step) <= COARSEST:
-            raise UsageError(f"the time step must be above 0 and at most {COARSEST:g} s, got {self.step:g} s")
+        check_step(number("step", self.step), COARSEST)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
 

@@ -158,13 +158,12 @@ class Refiner:
         repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
         x = given if repaired is None else repaired.x
         first = self._first(task, x)
+        outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
         if first.violation <= self.settings.violation_tolerance and not task.at_rest:
-            outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
             cost = first.cost - self.check.transcription(task).gauge(first.x)
             yield Attempt(first.x, 0.0, cost, outcome, first.iterations)  # most are valid; no need to measure
             best = self._measured(task, first.x, Outcome.SOLVED)
         else:
-            outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
             best = self._measured(task, first.x, outcome, first.iterations)
             yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED)

@@ -149,7 +149,7 @@ class Transcription:
         log = x[self.split :]
         slope = self.grid.gauss * rate
         inverse = 1.0 / (self.grid.gauss @ rate)
-        cost = float(inverse @ self.grid.weights + 0.5 * log @ self._smooth @ log)
+        cost = float(inverse @ self.grid.weights) + self.gauge(x)
         gradient = np.zeros(self.nx)
         gradient[self.split :] = -((self.grid.weights * inverse**2) @ slope) + self._smooth @ log
         curvature = np.zeros((self.nx, self.nx))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arguments import numbers
 from cnpgen.errors import UsageError
 from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, assemble
@@ -76,18 +77,13 @@ def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
 
 def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
     """Return the boundary as arrays, if it is one of one motion."""
-    found: dict[str, Array | None] = {}
-    for name, value in vars(boundary).items():
-        try:
-            found[name] = None if value is None else np.asarray(value, np.float64)
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"the boundary's {name} must be an array of numbers: {error}") from error
-        row = found[name]
-        if row is not None and row.shape != (1, n):
+    found = {name: numbers(f"the boundary's {name}", row) for name, row in vars(boundary).items() if row is not None}
+    for name, row in found.items():
+        if row.shape != (1, n):
             raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}")
-        if row is not None and not np.isfinite(row).all():
+        if not np.isfinite(row).all():
             raise UsageError(f"the boundary's {name} must be finite, got {row[0]}")
-    return Boundary(**found)  # type: ignore[arg-type]
+    return Boundary(**found)
 
 
 @dataclass(frozen=True)

@@ -111,8 +111,8 @@ class Motion:
     def duration(self) -> Array:
         """Duration ``T = integral of 1 / r`` [s], shape (N,); inf where r is not positive, nan where not finite."""
         total = np.empty(len(self))
-        for which, edges in self._cells():
-            total[which] = self[which]._times_at(edges, self._table(edges))[:, -1]
+        for which, edges, table in self._cells():
+            total[which] = self[which]._times_at(edges, table)[:, -1]
         total[~self.runs_forward()] = np.inf
         total[~np.isfinite(self.rate).all(axis=1)] = np.nan
         return total
@@ -131,11 +131,12 @@ class Motion:
         """
         s = np.clip(self._moments("phases", s), 0.0, 1.0)
         if s.ndim == 2:
-            return np.concatenate([self[[i]].time_at(s[i]) for i in range(len(self))]).reshape(s.shape)
+            return np.array([self[[i]].time_at(s[i])[0] for i in range(len(self))]).reshape(s.shape)
         times = np.empty((len(self), len(s)))
-        for which, coarse in self._cells():
+        for which, coarse, _ in self._cells():
             edges = np.union1d(coarse, s)
-            times[which] = self[which]._times_at(edges, self._table(edges))[:, np.searchsorted(edges, s)]
+            table = _nodes(edges, self.rate.shape[1], self.degree)
+            times[which] = self[which]._times_at(edges, table)[:, np.searchsorted(edges, s)]
         return times
 
     def _times_at(self, edges: Array, table: Array) -> Array:
@@ -166,13 +167,13 @@ class Motion:
         if len(blocks) > 1:
             return np.concatenate([self[block].phase_at(t[block]) for block in blocks])
         phases = np.empty(t.shape)
-        for which, edges in self._cells():
-            phases[which] = self[which]._phases_at(t[which], edges)
+        for which, edges, table in self._cells():
+            phases[which] = self[which]._phases_at(t[which], edges, table)
         return phases
 
-    def _phases_at(self, t: Array, edges: Array) -> Array:
+    def _phases_at(self, t: Array, edges: Array, table: Array) -> Array:
         """Return what ``phase_at`` does, with a quadrature over cells between the edges."""
-        known = self._times_at(edges, self._table(edges))
+        known = self._times_at(edges, table)
         with np.errstate(all="ignore"):
             t = np.clip(t, 0.0, known[:, -1:])
             found = [np.searchsorted(row, times, side="right") for row, times in zip(known, t, strict=True)]
@@ -209,26 +210,23 @@ class Motion:
             raise UsageError(f"{what} must have shape (K,) or ({len(self)}, K), got {found.shape}")
         return found
 
-    def _cells(self) -> Iterator[tuple[slice | list[int], Array]]:
-        """Yield groups of motions and the edges of the cells that ``t(s)`` is integrated over for them.
+    def _cells(self) -> Iterator[tuple[slice | list[int], Array, Array]]:
+        """Yield groups of motions, the edges of the cells that ``t(s)`` is integrated over for them, and ``_nodes``.
 
         They are the same for all motions but those whose r, though positive, has control points that are not: it may
         turn close to 0.
         """
-        shared = graded_edges(self.rate.shape[1], self.degree)
+        points, degree = self.rate.shape[1], self.degree
+        shared = _shared_cells(points, degree)
         near_zero = np.isfinite(self.rate).all(axis=1) & (self.rate <= 0).any(axis=1)
         if not near_zero.any():
-            yield slice(None), shared
+            yield slice(None), *shared
             return
-        yield np.flatnonzero(~near_zero).tolist(), shared
+        yield np.flatnonzero(~near_zero).tolist(), *shared
         for i in np.flatnonzero(near_zero).tolist():
-            s, r = extremes(self.rate[i], self.degree)
-            yield [i], edges_around(s, len(self.rate[i]), self.degree) if r.min() > 0 else shared
-
-    def _table(self, edges: Array) -> Array:
-        """Return the basis of r at the Gauss nodes of the cells between the edges, shape (R, cells x 8)."""
-        points, degree = self.rate.shape[1], self.degree
-        return _shared_nodes(points, degree) if edges is graded_edges(points, degree) else _nodes(edges, points, degree)
+            s, r = extremes(self.rate[i], degree)
+            edges = edges_around(s, points, degree)
+            yield [i], *((edges, _nodes(edges, points, degree)) if r.min() > 0 else shared)
 
     def _blocks(self, columns: int) -> list[slice]:
         """Split the motions so that arrays of shape (block, columns) stay in the cache."""
@@ -237,11 +235,14 @@ class Motion:
 
 
 @cache
-def _shared_nodes(points: int, degree: int) -> Array:
-    return _nodes(graded_edges(points, degree), points, degree)
+def _shared_cells(points: int, degree: int) -> tuple[Array, Array]:
+    """Return the edges of the cells of most motions, and ``_nodes`` of them."""
+    edges = graded_edges(points, degree)
+    return edges, _nodes(edges, points, degree)
 
 
 def _nodes(edges: Array, points: int, degree: int) -> Array:
+    """Return the basis of r at the Gauss nodes of the cells between the edges, shape (R, cells x 8)."""
     nodes = edges[:-1, None] + np.diff(edges)[:, None] * _NODES
     return basis(nodes.ravel(), points, degree).T
 

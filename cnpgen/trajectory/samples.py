@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.arguments import numbers
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import Boundary
 
@@ -24,8 +25,8 @@ def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[A
     Raises:
         UsageError: A shape is wrong, the times do not increase, or something is not finite.
     """
-    times, positions = _floats("t", t), _floats("q", q)
-    velocities = None if dq is None else _floats("dq", dq)
+    times, positions = numbers("t", t), numbers("q", q)
+    velocities = None if dq is None else numbers("dq", dq)
     if times.ndim != 1 or positions.ndim != 2 or len(positions) != len(times) or not positions.shape[1]:
         raise UsageError(f"t must have shape (K,) and q shape (K, n), got {times.shape} and {positions.shape}")
     if velocities is not None and velocities.shape != positions.shape:
@@ -40,13 +41,6 @@ def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[A
         where = int(np.argmin(np.diff(times) > 0))
         raise UsageError(f"t must increase, got {times[where]} s in sample {where}, then {times[where + 1]} s")
     return times, positions, velocities
-
-
-def _floats(name: str, values: ArrayLike) -> Array:
-    try:
-        return np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers: {error}") from error
 
 
 def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:

@@ -5,7 +5,6 @@ control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or dist
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,8 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spline import basis
 from cnpgen.verdict.closer import keep_worse, look_closer
-from cnpgen.verdict.course import Course, course, jerks
+from cnpgen.verdict.course import course, jerks
 from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
 from cnpgen.verdict.sampling import Samples, sample, time_table
@@ -112,14 +110,14 @@ class Judge:
         ]
 
 
-def check_step(step: float) -> None:
-    """Refuse a time step [s] that makes no sense.
+def check_step(step: float, most: float = LONGEST_STEP) -> None:
+    """Refuse a time step [s] that is not above 0 and at most ``most``.
 
     Raises:
         UsageError: It does not.
     """
-    if not 0 < step <= LONGEST_STEP:
-        raise UsageError(f"the time step must be above 0 and at most {LONGEST_STEP:g} s, got {step:g} s")
+    if not 0 < step <= most:
+        raise UsageError(f"the time step must be above 0 and at most {most:g} s, got {step:g} s")
 
 
 @dataclass(frozen=True)
@@ -186,25 +184,13 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     if not plan.is_finite() or not plan.motion.runs_forward()[0]:
         return True
     samples = Samples(_GLANCE, _GLANCE)
-    states = _glance(plan.motion)
+    states = course(plan.motion, samples.s)
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
     if not all(margin.ok for margin in constraint_margins(plan.problem, world, samples)):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
-
-
-def _glance(motion: Motion) -> Course:
-    """Evaluate one motion where ``_GLANCE`` looks."""
-    p, p1, p2 = (each @ motion.path[0] for each in _bases(motion.path.shape[1], motion.degree))
-    r, r1, _ = (each @ motion.rate[0, :, None] for each in _bases(motion.rate.shape[1], motion.degree))
-    return Course(p.T, (p1 * r).T, ((p2 * r + p1 * r1) * r).T)
-
-
-@cache
-def _bases(points: int, degree: int) -> tuple[Array, ...]:
-    return tuple(basis(_GLANCE, points, degree, order) for order in range(3))
 
 
 def _samples(plan: _Plan, step: float) -> Samples | Verdict:
