@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.pipelines.stage import Stage
 from cnpgen.recipes import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved
@@ -133,8 +133,8 @@ def _number(value: Any) -> str:
 
 def kind_name(item: Stage | Constraint) -> str:
     """Return the name under which the kind of a stage or constraint is registered."""
-    group = plugins.STAGES if isinstance(item, Stage) else plugins.CONSTRAINTS
-    return plugins.name_of(group, type(item))
+    group = registry.STAGES if isinstance(item, Stage) else registry.CONSTRAINTS
+    return registry.name_of(group, type(item))
 
 
 def kind_summary(kind: type) -> str:
@@ -152,10 +152,10 @@ def describe_kind(group: str, name: str) -> str:
     Raises:
         RecipeError: There is no such kind.
     """
-    kind = plugins.load(group, name)
+    kind = registry.load(group, name)
     head = ("key", "default", "meaning (value)")
     rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
-    noun = plugins.BASES[group].__name__.lower()
+    noun = registry.BASES[group].__name__.lower()
     text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
     return "\n".join([f"{noun} {name}", *_title(kind_summary(kind)), "", *text])
 
@@ -175,7 +175,7 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
     Raises:
         RecipeError: There is no such kind.
     """
-    kind = plugins.load(group, name)
+    kind = registry.load(group, name)
     left_out = ("hint", "default")
     entries = [
         {
@@ -186,7 +186,7 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
         }
         for key in keys(kind)
     ]
-    noun = plugins.BASES[group].__name__.lower()
+    noun = registry.BASES[group].__name__.lower()
     return {"kind": noun, "name": name, "summary": kind_summary(kind), "keys": entries}
 
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import PluginError, RecipeError, UsageError, nearest
 from cnpgen.parsing import Reader, parse
@@ -123,13 +123,13 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
 
     def problem(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
-        readers: dict[type, Reader] = {Constraint: partial(_read_kind, plugins.CONSTRAINTS)}
+        readers: dict[type, Reader] = {Constraint: partial(_read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
         digest = _digest(json.dumps(value, sort_keys=True).encode(), urdf.encode())
         return made and replace(made, path=path, digest=digest)
 
     def pipeline(value: Any, where: Place, mistakes: list[str]) -> Pipeline | None:
-        readers: dict[type, Reader] = {Stage: partial(_read_kind, plugins.STAGES), Problem: problem}
+        readers: dict[type, Reader] = {Stage: partial(_read_kind, registry.STAGES), Problem: problem}
         made = parse(Pipeline, value, where=where, mistakes=mistakes, readers=readers)
         return made and replace(made, path=path)
 
@@ -142,9 +142,9 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
 def _missing_plugins(content: dict[str, Any]) -> list[str]:
     """Say which packages a resolved recipe needs that are not installed."""
     pipeline = content["pipeline"]
-    kinds = [(plugins.STAGES, table) for _, table in tables(pipeline, "stage")]
-    kinds += [(plugins.CONSTRAINTS, table) for _, table in tables(pipeline["problem"], "constraint")]
-    found = (plugins.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for group, each in kinds)
+    kinds = [(registry.STAGES, table) for _, table in tables(pipeline, "stage")]
+    kinds += [(registry.CONSTRAINTS, table) for _, table in tables(pipeline["problem"], "constraint")]
+    found = (registry.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for group, each in kinds)
     return list(dict.fromkeys(text for text in found if text))
 
 
@@ -233,7 +233,7 @@ def _problem(path: Path, mistakes: list[str]) -> Problem | None:
         return None
     data, table = read
     where = Place(str(path))
-    readers: dict[type, Reader] = {Constraint: partial(_read_kind, plugins.CONSTRAINTS)}
+    readers: dict[type, Reader] = {Constraint: partial(_read_kind, registry.CONSTRAINTS)}
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
     before = len(mistakes)
     mistakes.extend(problem_mistakes(table, where, path.parent))
@@ -249,7 +249,7 @@ def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
         return None
     data, table = read
     readers: dict[type, Reader] = {
-        Stage: partial(_read_kind, plugins.STAGES),
+        Stage: partial(_read_kind, registry.STAGES),
         Problem: _reference("problem", _problem, path.parent),
     }
     made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
@@ -297,10 +297,10 @@ def _read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any
     """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
     use = value.get("use") if isinstance(value, dict) else None
     if not isinstance(use, str):
-        mistakes.append((where / "use").says(f"missing key, expected one of {', '.join(plugins.names(group))}"))
+        mistakes.append((where / "use").says(f"missing key, expected one of {', '.join(registry.names(group))}"))
         return None
     try:
-        kind = plugins.load(group, use)
+        kind = registry.load(group, use)
     except RecipeError as error:
         mistakes.extend((where / "use").says(text) for text in error.mistakes)
         return None

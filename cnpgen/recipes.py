@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.constraints.clearance import ObjectContact
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import UsageError
@@ -249,10 +249,10 @@ def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
 
 def _use(obj: object) -> dict[str, str]:
     """Label a stage or a constraint with the name of its kind and, for a plug-in, its package and code."""
-    for group, base in plugins.BASES.items():
+    for group, base in registry.BASES.items():
         if isinstance(obj, base):
-            source = plugins.source_digest(type(obj))
-            package = plugins.package_of(group, type(obj))
+            source = registry.source_digest(type(obj))
+            package = registry.package_of(group, type(obj))
             about = {"package": package, "source": source}
-            return {"use": plugins.name_of(group, type(obj)), **{key: text for key, text in about.items() if text}}
+            return {"use": registry.name_of(group, type(obj)), **{key: text for key, text in about.items() if text}}
     return {}

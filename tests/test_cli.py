@@ -428,16 +428,16 @@ def test_list_can_be_narrowed_and_read_by_programs(run):
 
 
 def test_a_broken_plug_in_does_not_hide_the_others(run, monkeypatch):
-    import cnpgen.plugins
+    import cnpgen.registry
 
-    load = cnpgen.plugins.load
+    load = cnpgen.registry.load
 
     def fail(group, name):
         if name == "goal-ik":
             raise RecipeError(["stage 'goal-ik' cannot be imported"])
         return load(group, name)
 
-    monkeypatch.setattr(cnpgen.plugins, "load", fail)
+    monkeypatch.setattr(cnpgen.registry, "load", fail)
     code, out, _ = run("list", "stages")
     assert code == 0
     assert "(broken: stage 'goal-ik' cannot be imported)" in out

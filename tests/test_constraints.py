@@ -15,8 +15,8 @@ from cnpgen.constraints.joint import JointAcceleration, JointPosition, JointTorq
 from cnpgen.constraints.table import Table
 from cnpgen.constraints.vertical import Vertical
 from cnpgen.library import load_problem
-from cnpgen.plugins import CONSTRAINTS, load, names
 from cnpgen.recipes import LimitSpec, Problem, RobotSpec
+from cnpgen.registry import CONSTRAINTS, load, names
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.schema import Range

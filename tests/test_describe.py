@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.describe import (
     WIDTH,
     describe,
@@ -24,7 +24,7 @@ from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, loa
 from cnpgen.schema import Range
 from cnpgen.store.documents import plain
 
-KINDS = [(group, name) for group in (plugins.STAGES, plugins.CONSTRAINTS) for name in plugins.names(group)]
+KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_every_kind_of_stage_and_constraint_is_described(group, name):
 
 def test_an_unknown_kind_is_refused_with_the_nearest_one():
     with pytest.raises(RecipeError, match="did you mean 'start-ik'"):
-        describe_kind(plugins.STAGES, "start-ikk")
+        describe_kind(registry.STAGES, "start-ikk")
 
 
 def test_a_summary_is_the_first_line_without_markup():

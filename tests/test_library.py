@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from example_stages import Roll
 
-from cnpgen import library, plugins
+from cnpgen import library, registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.library import (
@@ -18,8 +18,8 @@ from cnpgen.library import (
     load_problem,
     recipes_root,
 )
-from cnpgen.plugins import CONSTRAINTS, STAGES
 from cnpgen.recipes import recipe_digest, resolved
+from cnpgen.registry import CONSTRAINTS, STAGES
 from cnpgen.schema import Range, field
 
 
@@ -102,7 +102,7 @@ def _kinds(monkeypatch):
         STAGES: {"roll": "example_stages:Roll"},
         CONSTRAINTS: {"level": f"{__name__}:Level", "still": f"{__name__}:Still"},
     }
-    monkeypatch.setattr(plugins, "BUILT_IN", kinds)
+    monkeypatch.setattr(registry, "BUILT_IN", kinds)
 
 
 @pytest.fixture

@@ -314,11 +314,11 @@ class KeepOut(Constraint):
 
 
 def plugged_in(radius: float, monkeypatch: pytest.MonkeyPatch) -> Problem:
-    from cnpgen import plugins
+    from cnpgen import registry
 
-    original = plugins.name_of
+    original = registry.name_of
     monkeypatch.setattr(
-        plugins, "name_of", lambda group, kind: "keep-out" if kind is KeepOut else original(group, kind)
+        registry, "name_of", lambda group, kind: "keep-out" if kind is KeepOut else original(group, kind)
     )
     problem = PROBLEMS["airhockey"]
     two = (KeepOut(radius=radius, tolerance=1e-3, budget=1e-4, weight=2.0), KeepOut(radius=0.1, tolerance=1e-3))

@@ -6,11 +6,11 @@ from importlib.metadata import EntryPoint, EntryPoints
 import pytest
 from example_stages import Idle
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stage import Stage
-from cnpgen.plugins import CONSTRAINTS, STAGES, load, name_of, names
+from cnpgen.registry import CONSTRAINTS, STAGES, load, name_of, names
 from cnpgen.schema import field
 
 
@@ -52,13 +52,13 @@ def register(monkeypatch):
 
     def add(group, name, value):
         entries.append(EntryPoint(name=name, value=value, group=group))
-        plugins.installed.cache_clear()
+        registry.installed.cache_clear()
 
     monkeypatch.setattr("importlib.metadata.entry_points", fake)
-    monkeypatch.setattr(plugins, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}})
-    plugins.installed.cache_clear()
+    monkeypatch.setattr(registry, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}})
+    registry.installed.cache_clear()
     yield add
-    plugins.installed.cache_clear()
+    registry.installed.cache_clear()
 
 
 def test_a_built_in_kind_is_imported_by_name(register):
@@ -127,13 +127,13 @@ def test_two_plug_ins_with_one_name_are_an_error(register):
 
 
 def test_who_lacks_a_plug_in_is_told_which_package_to_install(register):
-    assert plugins.why_missing(STAGES, "roll", "") == ""
-    text = plugins.why_missing(STAGES, "toss", "dice-stages")
+    assert registry.why_missing(STAGES, "roll", "") == ""
+    text = registry.why_missing(STAGES, "toss", "dice-stages")
     assert "stage 'toss' comes from the package 'dice-stages', which is not installed" in text
     assert "pip install dice-stages" in text
-    assert "entry point group 'cnpgen.constraints'" in plugins.why_missing(CONSTRAINTS, "toss", "")
+    assert "entry point group 'cnpgen.constraints'" in registry.why_missing(CONSTRAINTS, "toss", "")
     register(STAGES, "toss", f"{__name__}:Toss")
-    assert plugins.why_missing(STAGES, "toss", "dice-stages") == ""
+    assert registry.why_missing(STAGES, "toss", "dice-stages") == ""
 
 
 def test_name_of_is_the_inverse_of_load(register):
@@ -148,11 +148,11 @@ def test_name_of_an_unregistered_class_says_where_it_is(register):
 
 
 def test_every_group_has_a_base():
-    assert {STAGES: Stage, CONSTRAINTS: Constraint} == plugins.BASES
-    assert plugins.BASES.keys() == plugins.BUILT_IN.keys()
+    assert {STAGES: Stage, CONSTRAINTS: Constraint} == registry.BASES
+    assert registry.BASES.keys() == registry.BUILT_IN.keys()
 
 
-@pytest.mark.parametrize("group", plugins.BASES)
+@pytest.mark.parametrize("group", registry.BASES)
 def test_every_built_in_kind_can_be_loaded(group):
-    for name in plugins.BUILT_IN[group]:
+    for name in registry.BUILT_IN[group]:
         assert name_of(group, load(group, name)) == name

@@ -39,11 +39,11 @@ def list_all(what: str) -> list[dict[str, Any]]:
     Args:
         what: One of ``WHAT``.
     """
-    from cnpgen import plugins
+    from cnpgen import registry
 
-    groups = {"stages": plugins.STAGES, "constraints": plugins.CONSTRAINTS}
+    groups = {"stages": registry.STAGES, "constraints": registry.CONSTRAINTS}
     if what in groups:
-        return [{"name": name, "title": _summary(groups[what], name)} for name in plugins.names(groups[what])]
+        return [{"name": name, "title": _summary(groups[what], name)} for name in registry.names(groups[what])]
     return {"datasets": _datasets, "models": _models, "pipelines": _pipelines, "problems": _problems}[what]()
 
 
@@ -96,12 +96,12 @@ def _problems() -> list[dict[str, Any]]:
 
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
-    from cnpgen import plugins
+    from cnpgen import registry
     from cnpgen.describe import kind_summary
     from cnpgen.errors import RecipeError
 
     try:
-        return kind_summary(plugins.load(group, name))
+        return kind_summary(registry.load(group, name))
     except RecipeError as error:
         return f"(broken: {error})"
 

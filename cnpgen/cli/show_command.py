@@ -41,12 +41,12 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen import describe, plugins
+    from cnpgen import describe, registry
     from cnpgen.store.documents import plain, render
 
     if arguments.recipe is None:
         group, name = (
-            (plugins.STAGES, arguments.stage) if arguments.stage else (plugins.CONSTRAINTS, arguments.constraint)
+            (registry.STAGES, arguments.stage) if arguments.stage else (registry.CONSTRAINTS, arguments.constraint)
         )
         if arguments.kind:
             raise UsageError("--kind says which recipe is meant: it goes with NAME or FILE only")

@@ -86,10 +86,10 @@ class Constraint(ABC):
     """One term of the constraint manifold: a condition on every state of a motion, and on its ends.
 
     A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]`` table in ``problem.toml``; it is
-    registered under a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.constraints``.
+    registered under a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.constraints``.
 
     ``tolerance`` has another unit in every kind (of the condition, or a fraction of a limit), so a kind declares it
-    again with ``cnpgen.schema.field``.
+    again with ``cnpgen.plugins.field``.
 
     Attributes:
         reason: The name under which a sample that breaks the constraint is counted.

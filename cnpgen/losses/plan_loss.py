@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.arguments import flag, number
 from cnpgen.errors import UsageError, nearest
 from cnpgen.kernels.grid import GridKernel
@@ -211,7 +211,7 @@ def _names(problem: Problem) -> list[str]:
     """Name the constraint terms by their kinds; the second of a kind is called kind-2, and so on."""
     names: list[str] = []
     for constraint in problem.constraint:
-        kind = plugins.name_of(plugins.CONSTRAINTS, type(constraint))
+        kind = registry.name_of(registry.CONSTRAINTS, type(constraint))
         count = 1 + sum(type(other) is type(constraint) for other in problem.constraint[: len(names)])
         names.append(kind if count == 1 else f"{kind}-{count}")
     return names

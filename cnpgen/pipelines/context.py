@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import TypeVar
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
@@ -39,7 +39,7 @@ class Context:
         for constraint in self.problem.constraint:
             if isinstance(constraint, kind):
                 return constraint
-        name = plugins.name_of(plugins.CONSTRAINTS, kind)
+        name = registry.name_of(registry.CONSTRAINTS, kind)
         raise RecipeError([f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"])
 
     def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:

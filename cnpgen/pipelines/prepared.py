@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen import plugins
+from cnpgen import registry
 from cnpgen.constraints.constraint import EXACTNESS
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.fields import Field
@@ -160,7 +160,7 @@ def _prepare(pipeline: Pipeline, context: Context) -> list[tuple[str, Run]]:
     """Prepare and label every stage; raise all their mistakes at once, each with file and stage."""
     runs, mistakes = [], []
     for number, stage in enumerate(pipeline.stage, start=1):
-        kind = plugins.name_of(plugins.STAGES, type(stage))
+        kind = registry.name_of(registry.STAGES, type(stage))
         try:
             runs.append((f"{number}. {kind}", stage.prepare(context)))
         except RecipeError as error:
@@ -187,7 +187,7 @@ def _check_needs(pipeline: Pipeline, context: Context) -> set[str]:
     for number, stage in enumerate(pipeline.stage, start=1):
         missing = [name for name in stage.needs if name not in written]
         if missing:
-            kind = plugins.name_of(plugins.STAGES, type(stage))
+            kind = registry.name_of(registry.STAGES, type(stage))
             text = f"needs {', '.join(missing)}, which no stage before it writes"
             mistakes.append(f"{pipeline.path}: stage {number} ({kind}): {text}")
         written.update(stage.writes(context))

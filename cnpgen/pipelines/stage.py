@@ -78,7 +78,7 @@ class Stage(ABC):
     """One step of a pipeline.
 
     A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table; it is registered under
-    a name in ``cnpgen.plugins`` or by a package's entry point in the group ``cnpgen.stages``.
+    a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.stages``.
 
     Attributes:
         needs: Columns that earlier stages must have written.

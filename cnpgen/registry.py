@@ -1,0 +1,194 @@
+"""The registry of stages and constraints: built-in kinds by name, others from entry points of installed packages."""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib
+import importlib.metadata
+import inspect
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from cnpgen.constraints.constraint import Constraint
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.pipelines.stage import Stage
+
+STAGES = "cnpgen.stages"
+CONSTRAINTS = "cnpgen.constraints"
+
+BASES: dict[str, type] = {STAGES: Stage, CONSTRAINTS: Constraint}
+
+BUILT_IN: dict[str, dict[str, str]] = {
+    STAGES: {
+        "draw-positions": "cnpgen.pipelines.draw:DrawPositions",
+        "start-ik": "cnpgen.pipelines.ik:StartIK",
+        "goal-ik": "cnpgen.pipelines.ik:GoalIK",
+        "hit-angle-to-goal": "cnpgen.pipelines.hit_angle:HitAngleToGoal",
+        "hit-angle-in-cone": "cnpgen.pipelines.hit_angle:HitAngleInCone",
+        "hitting-configuration": "cnpgen.pipelines.hitting_configuration:HittingConfiguration",
+        "hitting-velocity": "cnpgen.pipelines.hitting_velocity:HittingVelocity",
+        "at-rest": "cnpgen.pipelines.motion:AtRest",
+        "table-velocity": "cnpgen.pipelines.motion:TableVelocity",
+        "table-acceleration": "cnpgen.pipelines.motion:TableAcceleration",
+        "ballistic-reach": "cnpgen.pipelines.reach:BallisticReach",
+        "braking-reach": "cnpgen.pipelines.braking:BrakingReach",
+        "collision": "cnpgen.pipelines.collision:Collision",
+        "gravity-torque": "cnpgen.pipelines.torque:GravityTorque",
+        "certified-plan": "cnpgen.certification:CertifiedPlan",
+    },
+    CONSTRAINTS: {
+        "joint-position": "cnpgen.constraints.joint:JointPosition",
+        "joint-velocity": "cnpgen.constraints.joint:JointVelocity",
+        "joint-acceleration": "cnpgen.constraints.joint:JointAcceleration",
+        "joint-torque": "cnpgen.constraints.joint:JointTorque",
+        "table": "cnpgen.constraints.table:Table",
+        "vertical": "cnpgen.constraints.vertical:Vertical",
+        "robot-clearance": "cnpgen.constraints.clearance:RobotClearance",
+        "object-contact": "cnpgen.constraints.clearance:ObjectContact",
+    },
+}
+
+
+def names(group: str) -> tuple[str, ...]:
+    """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
+
+    Args:
+        group: ``STAGES`` or ``CONSTRAINTS``.
+    """
+    others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
+    return (*BUILT_IN[group], *sorted(others))
+
+
+def load(group: str, name: str) -> type[Any]:
+    """Import the class of a kind.
+
+    Args:
+        group: ``STAGES`` or ``CONSTRAINTS``.
+        name: Name of the kind, as ``use`` has it in a recipe.
+
+    Returns:
+        A concrete subclass of ``Stage`` or ``Constraint``.
+
+    Raises:
+        RecipeError: The kind is unknown, defined twice, or cannot be imported.
+    """
+    sources = _sources(group, name)
+    noun = BASES[group].__name__.lower()
+    if not sources:
+        known = names(group)
+        hint = nearest(name, known)
+        raise RecipeError([f"unknown {noun} {name!r}{hint}; known: {', '.join(known)}"])
+    if len(sources) > 1:
+        raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
+    source, importer = next(iter(sources.items()))
+    return _imported(importer, f"{noun} {name!r} of {source}", base=BASES[group])
+
+
+def name_of(group: str, kind: type) -> str:
+    """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
+
+    Args:
+        group: ``STAGES`` or ``CONSTRAINTS``.
+        kind: The class.
+    """
+    spec = f"{kind.__module__}:{kind.__qualname__}"
+    for name, built_in in BUILT_IN[group].items():
+        if built_in == spec:
+            return name
+    for entry in installed(group):
+        with contextlib.suppress(RecipeError):  # a broken plug-in is no reason to fail here
+            if entry.value == spec or load(group, entry.name) is kind:
+                return entry.name
+    return spec
+
+
+def source_digest(kind: type) -> str:
+    """Hash the source of the package that a plug-in comes from; empty for built-in kinds.
+
+    What a plug-in computes decides rows and kernels as much as its parameters do.
+    """
+    package = kind.__module__.partition(".")[0]
+    return "" if package == "cnpgen" else package_digest(package)
+
+
+def package_digest(package: str) -> str:
+    """Hash the source files of an imported top-level package or module; empty if it has none."""
+    source = getattr(sys.modules.get(package), "__file__", None)
+    if not source:
+        return ""
+    path = Path(source)
+    files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def package_of(group: str, kind: type) -> str:
+    """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
+    name = name_of(group, kind)
+    found = [entry.dist.name for entry in installed(group) if entry.name == name and entry.dist]
+    return found[0] if found else ""
+
+
+def why_missing(group: str, use: str, package: str) -> str:
+    """Say which package to install for a kind that a recipe of somebody else names; empty if the kind is there.
+
+    Args:
+        group: ``STAGES`` or ``CONSTRAINTS``.
+        use: Name of the kind.
+        package: The package that had it, empty if that is not known.
+    """
+    if use in names(group):
+        return ""
+    noun = BASES[group].__name__.lower()
+    if not package:
+        return f"{noun} {use!r} is not installed: install the package that registers it (entry point group {group!r})"
+    return (
+        f"{noun} {use!r} comes from the package {package!r}, which is not installed:"
+        f" run 'pip install {package}', or install it from its source"
+    )
+
+
+@functools.cache
+def installed(group: str) -> tuple[importlib.metadata.EntryPoint, ...]:
+    """List the entry points of installed packages; reading their metadata takes milliseconds, so it is done once."""
+    return tuple(importlib.metadata.entry_points(group=group))
+
+
+def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
+    """List who defines a kind, and how to import it from there."""
+    found: dict[str, Callable[[], Any]] = {}
+    if name in BUILT_IN[group]:
+        module, _, attribute = BUILT_IN[group][name].partition(":")
+        found["cnpgen"] = lambda: getattr(importlib.import_module(module), attribute)
+    for entry in installed(group):
+        if entry.name == name:
+            package = entry.dist.name if entry.dist else "an installed package"
+            found[f"{package} ({entry.value})"] = entry.load
+    return found
+
+
+def _imported(importer: Callable[[], Any], what: str, *, base: type) -> type[Any]:
+    """Import a class and check that it is a concrete kind of ``base``."""
+    try:
+        kind = importer()
+    except Exception as error:  # somebody else's module may raise anything while it is imported
+        raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
+    if not (inspect.isclass(kind) and issubclass(kind, base)):
+        raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
+    faults = list(_faults(kind))
+    if faults:
+        raise RecipeError([f"{what}: {fault}" for fault in faults])
+    return kind
+
+
+def _faults(kind: type[Any]) -> Iterator[str]:
+    """Say what keeps a class from being read from a table."""
+    if inspect.isabstract(kind):
+        yield f"{kind.__name__} is abstract, it does not define {', '.join(sorted(kind.__abstractmethods__))}"
+    if "__dataclass_params__" not in vars(kind):
+        yield f"{kind.__name__} is not a dataclass"
+    for spec in dataclasses.fields(kind):
+        if spec.init and spec.default is dataclasses.MISSING and "doc" not in spec.metadata:
+            yield f"the field {spec.name!r} is not declared with cnpgen.plugins.field"
