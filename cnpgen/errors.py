@@ -55,3 +55,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return ``" (did you mean 'x'?)"`` for the known name nearest to ``name``, or an empty string."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def counted(number: int, noun: str) -> str:
+    """Write a number of things: ``"1 row"``, ``"120,000 rows"``."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen import __version__
+from cnpgen.errors import counted
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.engine import prepare, refine_part
@@ -21,7 +22,6 @@ from cnpgen.refine.journal import Journal, open_journal
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.threads import one_thread
-from cnpgen.wording import counted
 from cnpgen.workers import share_out, worker_count
 
 FORMAT = "cnpgen-refinement"

@@ -8,7 +8,7 @@ from typing import Any
 from cnpgen.arguments import integer
 from cnpgen.consistency import check_recipe, check_statistics, restored
 from cnpgen.deep_check import DeepCheck, check_rows
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, counted
 from cnpgen.regeneration import Regeneration, backend_of, make_again
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.layout import PLAN
@@ -17,7 +17,6 @@ from cnpgen.store.plan import DatasetPlan, load_plan, shards
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
 from cnpgen.verify.report import RowReport
-from cnpgen.wording import counted
 from cnpgen.workers import worker_count
 
 

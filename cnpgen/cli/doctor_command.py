@@ -5,8 +5,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.errors import MachineError
-from cnpgen.wording import counted
+from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
     from cnpgen.doctor import MachineReport

@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _counted(exported: "Exported") -> str:
-    from cnpgen.wording import counted
+    from cnpgen.errors import counted
 
     all_plans = exported.count + len(exported.refused)
     return counted(exported.count, "plan") + (f" of {all_plans:,}" if exported.refused else "")

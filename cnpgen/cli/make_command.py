@@ -8,7 +8,7 @@ from cnpgen.cli import values
 from cnpgen.cli.interruption import raise_if_interrupted
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.progress import Meter
-from cnpgen.wording import counted
+from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -9,7 +9,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.refine_options import REFINING, WORKERS, add_refining, check_place, refine_and_save
-from cnpgen.wording import counted
+from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.planner.model import Model

@@ -5,7 +5,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.wording import counted
+from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.outcome import Outcome

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.progress import Meter
-from cnpgen.wording import counted
+from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.describe import table
-from cnpgen.wording import counted
+from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation

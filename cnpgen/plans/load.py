@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
+from cnpgen.errors import DatasetError, RecipeError, UsageError, counted, nearest
 from cnpgen.library import load_problem
 from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
@@ -20,7 +20,6 @@ from cnpgen.store.heaps import opened_foreign_hdf5
 from cnpgen.store.kinds import file_kind
 from cnpgen.store.places import require_file
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.wording import counted
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.arguments import integer
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.plans.layout import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
-from cnpgen.wording import counted
 
 Array = NDArray[np.float64]
 

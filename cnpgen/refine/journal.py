@@ -13,10 +13,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, UsageError
+from cnpgen.errors import MachineError, UsageError, counted
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.store.files import machine_error
-from cnpgen.wording import counted
 
 MAGIC = b"cnpgen journal 1\n"
 LONGEST = 80  # characters of two values that a message shows
