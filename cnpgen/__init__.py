@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cnpgen.export.plans import export_plans
     from cnpgen.inspection import inspect_dataset
     from cnpgen.interop.omega import Omega
-    from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, load_problem
+    from cnpgen.library import load_dataset_recipe, load_pipeline, load_problem
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
     from cnpgen.losses.metric import Metric
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from cnpgen.refine.proof import explain_plans
     from cnpgen.refinement import Refinement, refine_plans
     from cnpgen.robots.obstacles import obstacle_tops
+    from cnpgen.schema.catalogue import list_recipes
     from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.reader import open_dataset
     from cnpgen.training.settings import TrainingSettings
@@ -66,7 +67,7 @@ _HOME = {
     "export_plans": "export.plans",
     "fit_motion": "trajectory.fit",
     "inspect_dataset": "inspection",
-    "list_recipes": "library",
+    "list_recipes": "schema.catalogue",
     "load_dataset": "loader.load",
     "load_dataset_recipe": "library",
     "load_model": "planner.model_file",

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.pipelines.stage import Stage
 from cnpgen.recipes import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved
 from cnpgen.robots.robot import Robot, load_robot
-from cnpgen.schema import Key, Range, keys
+from cnpgen.schema import registry
+from cnpgen.schema.keys import Key, Range, keys
 
 WIDTH = 100
 

@@ -268,8 +268,9 @@ def _check_backend(found: _Findings, cache: str) -> tuple[str, str, bool]:
 def _check_recipes(found: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
-        from cnpgen.library import list_recipes, load_dataset_recipe, recipes_root
+        from cnpgen.library import load_dataset_recipe
         from cnpgen.robots.robot import load_robot
+        from cnpgen.schema.catalogue import list_recipes, recipes_root
 
         names = list(list_recipes("dataset"))
         for name in names:

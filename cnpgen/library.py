@@ -1,32 +1,21 @@
 """Find, list and load recipes: those that cnpgen ships by name, anybody's by path."""
 
-import hashlib
 import json
-import os
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
-from cnpgen.errors import PluginError, RecipeError, UsageError, nearest
-from cnpgen.parsing import Reader, parse
+from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stage import Stage
 from cnpgen.recipe_checks import problem_mistakes, tables
-from cnpgen.recipe_files import Kind, is_kind, read_table
 from cnpgen.recipes import DatasetRecipe, Pipeline, Problem
-from cnpgen.schema import Place
-from cnpgen.units import show
-
-Recipe = TypeVar("Recipe", Problem, Pipeline, DatasetRecipe)
-
-_LAYOUT: dict[Kind, str] = {  # where the shipped files of a kind are
-    "problem": "problems/*/problem.toml",
-    "pipeline": "pipelines/*.toml",
-    "dataset": "datasets/*.toml",
-}
+from cnpgen.schema import registry
+from cnpgen.schema.catalogue import digest_of, find_file, load_recipe, read_kind, reference
+from cnpgen.schema.keys import Place
+from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.toml import Kind, is_kind, read_table
 
 
 def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
@@ -39,7 +28,7 @@ def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -
     Raises:
         RecipeError: With every mistake in the file.
     """
-    return _load(("problem",), name_or_path, relative_to, _problem)
+    return load_recipe(("problem",), name_or_path, relative_to, _problem)
 
 
 def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) -> Pipeline:
@@ -52,7 +41,7 @@ def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) 
     Raises:
         RecipeError: With every mistake in both files.
     """
-    return _load(("pipeline",), name_or_path, relative_to, _pipeline)
+    return load_recipe(("pipeline",), name_or_path, relative_to, _pipeline)
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
@@ -67,7 +56,7 @@ def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = 
     Raises:
         RecipeError: With every mistake in all three files.
     """
-    return _load(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
+    return load_recipe(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
 
 
 def dataset_recipe_of(recipe: object) -> DatasetRecipe:
@@ -123,13 +112,13 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
 
     def problem(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
-        readers: dict[type, Reader] = {Constraint: partial(_read_kind, registry.CONSTRAINTS)}
+        readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
-        digest = _digest(json.dumps(value, sort_keys=True).encode(), urdf.encode())
+        digest = digest_of(json.dumps(value, sort_keys=True).encode(), urdf.encode())
         return made and replace(made, path=path, digest=digest)
 
     def pipeline(value: Any, where: Place, mistakes: list[str]) -> Pipeline | None:
-        readers: dict[type, Reader] = {Stage: partial(_read_kind, registry.STAGES), Problem: problem}
+        readers: dict[type, Reader] = {Stage: partial(read_kind, registry.STAGES), Problem: problem}
         made = parse(Pipeline, value, where=where, mistakes=mistakes, readers=readers)
         return made and replace(made, path=path)
 
@@ -159,13 +148,6 @@ def _without_defaults(value: Any) -> Any:
     return [_without_defaults(entry) for entry in value] if isinstance(value, list) else value
 
 
-def list_recipes(kind: Kind) -> dict[str, Path]:
-    """List the shipped recipes of a kind: name -> file, by name."""
-    folder, _, pattern = _LAYOUT[kind].partition("/")
-    files = sorted((recipes_root() / folder).glob(pattern))
-    return {file.parent.name if kind == "problem" else file.stem: file for file in files}
-
-
 def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | None = None) -> Path:
     """Find the file of a recipe.
 
@@ -178,53 +160,9 @@ def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | Non
         RecipeError: There is no such recipe.
     """
     try:
-        return _find((kind,), name_or_path, relative_to)
+        return find_file((kind,), name_or_path, relative_to)
     except ValueError as error:
         raise RecipeError([str(error)]) from error
-
-
-def recipes_root() -> Path:
-    """Return the folder of the shipped recipes: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    installed = package / "_recipes"
-    return installed if installed.is_dir() else package.parent
-
-
-def _find(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None) -> Path:
-    """Find a recipe of one of several kinds, the first one first; a ValueError says why there is none."""
-    text = os.fspath(name_or_path)
-    path = (folder or Path()) / text
-    known = {name: file for kind in reversed(kinds) for name, file in list_recipes(kind).items()}
-    is_path = isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text or os.sep in text
-    if path.is_file():
-        return path
-    if is_path:
-        hint = nearest(Path(text).stem, known)
-        raise ValueError(
-            f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
-        )
-    if text not in known:
-        hint = nearest(text, known)
-        raise ValueError(f"unknown {kinds[0]} {text!r}{hint}; known: {', '.join(known) or 'none'}")
-    return known[text]
-
-
-def _load(
-    kinds: tuple[Kind, ...],
-    name_or_path: str | Path,
-    folder: Path | None,
-    build: Callable[[Path, list[str]], Recipe | None],
-) -> Recipe:
-    """Find, read and build a recipe, or raise all mistakes at once."""
-    try:
-        path = _find(kinds, name_or_path, folder)
-    except ValueError as error:
-        raise RecipeError([str(error)]) from error
-    mistakes: list[str] = []
-    recipe = build(path, mistakes)
-    if recipe is None or mistakes:
-        raise RecipeError(mistakes)
-    return recipe
 
 
 def _problem(path: Path, mistakes: list[str]) -> Problem | None:
@@ -233,14 +171,14 @@ def _problem(path: Path, mistakes: list[str]) -> Problem | None:
         return None
     data, table = read
     where = Place(str(path))
-    readers: dict[type, Reader] = {Constraint: partial(_read_kind, registry.CONSTRAINTS)}
+    readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
     before = len(mistakes)
     mistakes.extend(problem_mistakes(table, where, path.parent))
     if problem is None or len(mistakes) > before:
         return None
     problem = replace(problem, path=path.absolute())
-    return replace(problem, digest=_digest(data, problem.urdf_path.read_bytes()))
+    return replace(problem, digest=digest_of(data, problem.urdf_path.read_bytes()))
 
 
 def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
@@ -249,11 +187,11 @@ def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
         return None
     data, table = read
     readers: dict[type, Reader] = {
-        Stage: partial(_read_kind, registry.STAGES),
-        Problem: _reference("problem", _problem, path.parent),
+        Stage: partial(read_kind, registry.STAGES),
+        Problem: reference("problem", _problem, path.parent),
     }
     made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
-    return made and replace(made, path=path.absolute(), digest=_digest(data, made.problem.digest.encode()))
+    return made and replace(made, path=path.absolute(), digest=digest_of(data, made.problem.digest.encode()))
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
@@ -264,9 +202,9 @@ def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
     if not is_kind("dataset", table) and is_kind("pipeline", table):
         pipeline = _pipeline(path, mistakes)
         return _wrapped(pipeline) if pipeline else None
-    readers: dict[type, Reader] = {Pipeline: _reference("pipeline", _pipeline, path.parent)}
+    readers: dict[type, Reader] = {Pipeline: reference("pipeline", _pipeline, path.parent)}
     made = parse(DatasetRecipe, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
-    return made and replace(made, path=path.absolute(), digest=_digest(data, made.pipeline.digest.encode()))
+    return made and replace(made, path=path.absolute(), digest=digest_of(data, made.pipeline.digest.encode()))
 
 
 def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
@@ -277,36 +215,5 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         pipeline=pipeline,
         splits={"train": 90, "validation": 10},
         path=pipeline.path,
-        digest=_digest(b"", pipeline.digest.encode()),
+        digest=digest_of(b"", pipeline.digest.encode()),
     )
-
-
-def _reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
-    """Return what reads a key that names another recipe."""
-
-    def read(value: Any, where: Place, mistakes: list[str]) -> Any:
-        if isinstance(value, str):
-            return build(_find((kind,), value, folder), mistakes)
-        mistakes.append(where.says(f"expected a name or a path, got {show(value)}"))
-        return None
-
-    return read
-
-
-def _read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any:
-    """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
-    use = value.get("use") if isinstance(value, dict) else None
-    if not isinstance(use, str):
-        mistakes.append((where / "use").says(f"missing key, expected one of {', '.join(registry.names(group))}"))
-        return None
-    try:
-        kind = registry.load(group, use)
-    except RecipeError as error:
-        mistakes.extend((where / "use").says(text) for text in error.mistakes)
-        return None
-    rest = {key: entry for key, entry in value.items() if key != "use"}
-    return parse(kind, rest, where=where, mistakes=mistakes)
-
-
-def _digest(*parts: bytes) -> str:
-    return hashlib.sha256(b"".join(parts)).hexdigest()

@@ -9,7 +9,6 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
-from cnpgen.arguments import integer
 from cnpgen.certification import certified
 from cnpgen.data_card import load_notes
 from cnpgen.errors import UsageError
@@ -19,6 +18,7 @@ from cnpgen.make_shard import Job, make_shards
 from cnpgen.outcome import Outcome
 from cnpgen.pipelines.stage import BLOCK_ROWS
 from cnpgen.recipes import DatasetRecipe
+from cnpgen.schema.arguments import integer
 from cnpgen.store.check import check_documents
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize, source_date

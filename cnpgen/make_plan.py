@@ -4,13 +4,13 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from cnpgen.arguments import integer
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import dataset_recipe_of
 from cnpgen.make_shard import Job, versions
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest, resolved, split_rows
+from cnpgen.schema.arguments import integer
 from cnpgen.store.plan import DatasetPlan, default_shard_size, load_plan
 
 MAX_ROWS = 10**12

@@ -5,7 +5,7 @@ from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Stage
 from cnpgen.robots.symbolic import SymbolicState
-from cnpgen.schema import Range, field
+from cnpgen.schema.keys import Range, field
 from cnpgen.verify.world import World
 
 __all__ = ["Batch", "Condition", "Constraint", "Context", "Field", "Range", "Stage", "SymbolicState", "World", "field"]

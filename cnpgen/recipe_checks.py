@@ -6,8 +6,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 from cnpgen.errors import nearest
-from cnpgen.schema import Place
-from cnpgen.units import show
+from cnpgen.schema.keys import Place
+from cnpgen.schema.units import show
 
 
 def problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:

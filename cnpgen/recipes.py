@@ -8,14 +8,13 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from cnpgen import registry
 from cnpgen.constraints.clearance import ObjectContact
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.stage import Stage
-from cnpgen.schema import Range, field, to_dict
+from cnpgen.schema import registry
+from cnpgen.schema.keys import NAME, Range, field, to_dict
 
-NAME = "^[a-z0-9][a-z0-9-]*$"
 SPLIT_NAME = "^[a-z][a-z0-9_]*$"
 VERSION = r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$"
 

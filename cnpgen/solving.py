@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import dataset_recipe_of
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.recipes import DatasetRecipe
+from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:

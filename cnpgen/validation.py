@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cnpgen.arguments import integer
 from cnpgen.consistency import check_recipe, check_statistics, restored
 from cnpgen.deep_check import DeepCheck, check_rows
 from cnpgen.errors import DatasetError, counted
 from cnpgen.regeneration import Regeneration, backend_of, make_again
+from cnpgen.schema.arguments import integer
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.layout import PLAN
 from cnpgen.store.places import require_folder

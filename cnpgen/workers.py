@@ -11,8 +11,8 @@ from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
-from cnpgen.arguments import integer
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.schema.arguments import integer
 
 _HELD = (signal.SIGINT, signal.SIGTERM)
 _TIDIED = "ignore:resource_tracker:UserWarning"  # as the option -W takes it: the beginning of the message

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from cnpgen.pipelines.stage import Stage
-from cnpgen.schema import Range, field
+from cnpgen.schema.keys import Range, field
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -428,16 +428,16 @@ def test_list_can_be_narrowed_and_read_by_programs(run):
 
 
 def test_a_broken_plug_in_does_not_hide_the_others(run, monkeypatch):
-    import cnpgen.registry
+    import cnpgen.schema.registry
 
-    load = cnpgen.registry.load
+    load = cnpgen.schema.registry.load
 
     def fail(group, name):
         if name == "goal-ik":
             raise RecipeError(["stage 'goal-ik' cannot be imported"])
         return load(group, name)
 
-    monkeypatch.setattr(cnpgen.registry, "load", fail)
+    monkeypatch.setattr(cnpgen.schema.registry, "load", fail)
     code, out, _ = run("list", "stages")
     assert code == 0
     assert "(broken: stage 'goal-ik' cannot be imported)" in out
@@ -453,7 +453,7 @@ def test_show_prefers_the_dataset_and_can_be_told_otherwise(run):
 
 @pytest.mark.parametrize("kind", ["dataset", "pipeline", "problem"])
 def test_show_tells_the_kind_of_a_file(run, kind):
-    from cnpgen.library import list_recipes
+    from cnpgen.schema.catalogue import list_recipes
 
     path = list_recipes(kind)["heavy-object"]
     assert run("show", path)[1].startswith(f"{kind} heavy-object")

@@ -16,10 +16,10 @@ from cnpgen.constraints.table import Table
 from cnpgen.constraints.vertical import Vertical
 from cnpgen.library import load_problem
 from cnpgen.recipes import LimitSpec, Problem, RobotSpec
-from cnpgen.registry import CONSTRAINTS, load, names
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.robots.symbolic import SymbolicState, symbols
-from cnpgen.schema import Range
+from cnpgen.schema.keys import Range
+from cnpgen.schema.registry import CONSTRAINTS, load, names
 from cnpgen.verify.world import World
 
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")

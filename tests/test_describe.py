@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen import registry
 from cnpgen.describe import (
     WIDTH,
     describe,
@@ -20,8 +19,10 @@ from cnpgen.describe import (
     table,
 )
 from cnpgen.errors import RecipeError
-from cnpgen.library import list_recipes, load_dataset_recipe, load_pipeline, load_problem
-from cnpgen.schema import Range
+from cnpgen.library import load_dataset_recipe, load_pipeline, load_problem
+from cnpgen.schema import registry
+from cnpgen.schema.catalogue import list_recipes
+from cnpgen.schema.keys import Range
 from cnpgen.store.documents import plain
 
 KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]

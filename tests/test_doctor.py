@@ -140,7 +140,7 @@ def test_a_container_with_fewer_cores_is_a_note(monkeypatch):
 
 
 def test_recipes_that_do_not_load_are_a_problem(monkeypatch, tmp_path):
-    monkeypatch.setattr("cnpgen.library.recipes_root", lambda: tmp_path)
+    monkeypatch.setattr("cnpgen.schema.catalogue.recipes_root", lambda: tmp_path)
     report = check_machine()
     assert not report.ok
     assert "no recipes" in report.problems[0]

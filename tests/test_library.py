@@ -7,20 +7,14 @@ from pathlib import Path
 import pytest
 from example_stages import Roll
 
-from cnpgen import library, registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
-from cnpgen.library import (
-    find_recipe,
-    list_recipes,
-    load_dataset_recipe,
-    load_pipeline,
-    load_problem,
-    recipes_root,
-)
+from cnpgen.library import find_recipe, load_dataset_recipe, load_pipeline, load_problem
 from cnpgen.recipes import recipe_digest, resolved
-from cnpgen.registry import CONSTRAINTS, STAGES
-from cnpgen.schema import Range, field
+from cnpgen.schema import catalogue, registry
+from cnpgen.schema.catalogue import list_recipes, recipes_root
+from cnpgen.schema.keys import Range, field
+from cnpgen.schema.registry import CONSTRAINTS, STAGES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +117,7 @@ def files(tmp_path) -> dict[str, Path]:
 @pytest.fixture
 def shipped(files, tmp_path, monkeypatch):
     """Make them the recipes that cnpgen ships."""
-    monkeypatch.setattr(library, "recipes_root", lambda: tmp_path)
+    monkeypatch.setattr(catalogue, "recipes_root", lambda: tmp_path)
     return files
 
 
@@ -396,7 +390,7 @@ def test_a_missing_file_is_not_found_in_the_library_by_its_stem(shipped):
 def test_recipes_are_beside_the_package_in_a_checkout_and_inside_it_in_a_wheel(tmp_path, monkeypatch):
     package = tmp_path / "cnpgen"
     package.mkdir()
-    monkeypatch.setattr(library, "__file__", str(package / "library.py"))
+    monkeypatch.setattr(catalogue, "__file__", str(package / "schema" / "catalogue.py"))
     assert recipes_root() == tmp_path
     assert list_recipes("problem") == {}
     (package / "_recipes").mkdir()

@@ -10,7 +10,7 @@ from example_plans import PROBLEMS
 
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.value import LossValue
-from cnpgen.schema import Range
+from cnpgen.schema.keys import Range
 
 CASES = [(label, term, "signed") for label in ("hit", "transport") for term in loss(PROBLEM_OF[label]).terms]
 CASES += [("transport", term, "paper") for term in ("vertical", "robot-clearance", "object-contact")]

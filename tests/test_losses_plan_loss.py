@@ -17,7 +17,7 @@ from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import quadrature
 from cnpgen.recipes import Problem
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 from cnpgen.trajectory.motion import Motion
 
 PROBLEM_NAMES = ("airhockey", "heavy-object")
@@ -314,7 +314,7 @@ class KeepOut(Constraint):
 
 
 def plugged_in(radius: float, monkeypatch: pytest.MonkeyPatch) -> Problem:
-    from cnpgen import registry
+    from cnpgen.schema import registry
 
     original = registry.name_of
     monkeypatch.setattr(

@@ -6,12 +6,12 @@ from importlib.metadata import EntryPoint, EntryPoints
 import pytest
 from example_stages import Idle
 
-from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stage import Stage
-from cnpgen.registry import CONSTRAINTS, STAGES, load, name_of, names
-from cnpgen.schema import field
+from cnpgen.schema import registry
+from cnpgen.schema.keys import field
+from cnpgen.schema.registry import CONSTRAINTS, STAGES, load, name_of, names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def test_a_kind_of_the_other_group_is_unknown(register):
         ("builtins:dict", "is not a subclass of cnpgen.pipelines.stage.Stage"),
         (f"{__name__}:Abstract", "Abstract is abstract, it does not define prepare, provides"),
         (f"{__name__}:NotADataclass", "NotADataclass is not a dataclass"),
-        (f"{__name__}:Undeclared", "the field 'loaded' is not declared with cnpgen.schema.field"),
+        (f"{__name__}:Undeclared", "the field 'loaded' is not declared with cnpgen.plugins.field"),
     ],
 )
 def test_a_broken_plug_in_is_a_recipe_error(register, value, message):

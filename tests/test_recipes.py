@@ -10,7 +10,7 @@ import pytest
 from example_stages import Roll
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.library import list_recipes, load_dataset_recipe, load_problem
+from cnpgen.library import load_dataset_recipe, load_problem
 from cnpgen.recipes import (
     DatasetRecipe,
     LimitSpec,
@@ -23,7 +23,8 @@ from cnpgen.recipes import (
     resolved,
     split_rows,
 )
-from cnpgen.schema import Range
+from cnpgen.schema.catalogue import list_recipes
+from cnpgen.schema.keys import Range
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.parsing import parse
-from cnpgen.schema import Place, Range, field, keys, to_dict
+from cnpgen.schema.keys import Place, Range, field, keys, to_dict
+from cnpgen.schema.parsing import parse
 
 
 @dataclass(frozen=True, kw_only=True)

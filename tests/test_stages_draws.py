@@ -13,7 +13,7 @@ from cnpgen.pipelines.draw import DrawPositions
 from cnpgen.pipelines.hit_angle import wrap
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
-from cnpgen.schema import Range
+from cnpgen.schema.keys import Range
 
 DRAWS = 40_000
 PROBABLE = 1e-4  # p-value below which a sample is not believed to follow its law

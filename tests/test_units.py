@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cnpgen.units import UNITS, dimension, parse_number, parse_numbers, parse_range
+from cnpgen.schema.units import UNITS, dimension, parse_number, parse_numbers, parse_range
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
     Args:
         what: One of ``WHAT``.
     """
-    from cnpgen import registry
+    from cnpgen.schema import registry
 
     groups = {"stages": registry.STAGES, "constraints": registry.CONSTRAINTS}
     if what in groups:
@@ -48,7 +48,8 @@ def list_all(what: str) -> list[dict[str, Any]]:
 
 
 def _datasets() -> list[dict[str, Any]]:
-    from cnpgen.library import list_recipes, load_dataset_recipe
+    from cnpgen.library import load_dataset_recipe
+    from cnpgen.schema.catalogue import list_recipes
 
     entries = []
     for name, file in list_recipes("dataset").items():
@@ -72,7 +73,8 @@ def _models() -> list[dict[str, Any]]:
 
 
 def _pipelines() -> list[dict[str, Any]]:
-    from cnpgen.library import list_recipes, load_pipeline
+    from cnpgen.library import load_pipeline
+    from cnpgen.schema.catalogue import list_recipes
 
     entries = []
     for name, file in list_recipes("pipeline").items():
@@ -83,7 +85,8 @@ def _pipelines() -> list[dict[str, Any]]:
 
 
 def _problems() -> list[dict[str, Any]]:
-    from cnpgen.library import list_recipes, load_problem
+    from cnpgen.library import load_problem
+    from cnpgen.schema.catalogue import list_recipes
 
     entries = []
     for name, file in list_recipes("problem").items():
@@ -96,9 +99,9 @@ def _problems() -> list[dict[str, Any]]:
 
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
-    from cnpgen import registry
     from cnpgen.describe import kind_summary
     from cnpgen.errors import RecipeError
+    from cnpgen.schema import registry
 
     try:
         return kind_summary(registry.load(group, name))

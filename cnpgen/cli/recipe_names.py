@@ -58,8 +58,8 @@ def check_there(what: str) -> None:
 
 
 def _shipped(*kinds: str) -> set[str]:
-    from cnpgen.library import list_recipes
-    from cnpgen.recipe_files import MARKS
+    from cnpgen.schema.catalogue import list_recipes
+    from cnpgen.schema.toml import MARKS
 
     return {name for kind in MARKS if not kinds or kind in kinds for name in list_recipes(kind)}
 

@@ -11,7 +11,7 @@ from cnpgen.errors import RecipeError, UsageError, nearest
 
 if TYPE_CHECKING:
     from cnpgen.describe import Recipe
-    from cnpgen.recipe_files import Kind
+    from cnpgen.schema.toml import Kind
 
 KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
 
@@ -41,7 +41,8 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen import describe, registry
+    from cnpgen import describe
+    from cnpgen.schema import registry
     from cnpgen.store.documents import plain, render
 
     if arguments.recipe is None:
@@ -76,8 +77,8 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
 
 def _kind(name_or_path: str) -> "Kind":
     """Find out what kind of recipe is meant."""
-    from cnpgen.library import list_recipes
-    from cnpgen.recipe_files import kind_of_file
+    from cnpgen.schema.catalogue import list_recipes
+    from cnpgen.schema.toml import kind_of_file
 
     path = Path(name_or_path)
     if path.is_file():

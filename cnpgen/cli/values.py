@@ -94,7 +94,7 @@ def hertz(text: str) -> float:
 
 
 def _quantity(text: str, unit: str, expected: str) -> float:
-    from cnpgen.units import parse_number
+    from cnpgen.schema.units import parse_number
 
     try:
         number = parse_number(text, unit)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.robots.symbolic import SymbolicState

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.constraints.constraint import Condition, Constraint, End
-from cnpgen.schema import Range, field
+from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
     from cnpgen.robots.symbolic import SymbolicState

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.robots.symbolic import SymbolicState

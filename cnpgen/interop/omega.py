@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arguments import integer, number
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
 from cnpgen.library import problem_of
@@ -27,6 +26,7 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.recipes import Problem
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import load_robot
+from cnpgen.schema.arguments import integer, number
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
 from cnpgen.kernels.tape import CODES, Dtype, Grid, Loop, Tape, tape_from_function
 from cnpgen.kernels.together import Compilers
 from cnpgen.recipes import Problem, resolved
-from cnpgen.registry import package_digest
+from cnpgen.schema.registry import package_digest
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")

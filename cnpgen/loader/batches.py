@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.arguments import integer
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.columns import tail
@@ -17,6 +16,7 @@ from cnpgen.loader.order import Order
 from cnpgen.loader.position import Position, position_from_json, position_to_json
 from cnpgen.loader.source import Source
 from cnpgen.loader.windows import Windows
+from cnpgen.schema.arguments import integer
 
 
 class Batches:

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from cnpgen.arguments import flag, integer
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import flag, integer
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cnpgen.arguments import flag
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.shards import Shard, ShardReader
+from cnpgen.schema.arguments import flag
 from cnpgen.store.documents import load_document
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import STATS

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from cnpgen.arguments import flag, integer
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.source import Source
+from cnpgen.schema.arguments import flag, integer
 
 FORMAT = "cnpgen-loader-state"
 FORMAT_VERSION = 1  # raised also when the arithmetic of the order changes

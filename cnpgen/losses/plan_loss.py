@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen import registry
-from cnpgen.arguments import flag, number
 from cnpgen.errors import UsageError, nearest
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
@@ -23,6 +21,8 @@ from cnpgen.losses.stage import GRADIENT, VALUES, WIDER, loss_gradient, loss_val
 from cnpgen.losses.value import LossValue
 from cnpgen.recipes import Problem
 from cnpgen.robots.robot import load_robot
+from cnpgen.schema import registry
+from cnpgen.schema.arguments import flag, number
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")

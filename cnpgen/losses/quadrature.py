@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.arguments import integer
 from cnpgen.errors import UsageError, nearest
 from cnpgen.recipes import TrajectorySpec
+from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]

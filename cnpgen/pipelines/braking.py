@@ -21,7 +21,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.robots.linalg import Scalar, add, dot, scale
 from cnpgen.robots.symbolic import Vec, bias_acceleration, forward_kinematics, symbols, tip_velocity
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

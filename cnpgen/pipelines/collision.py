@@ -20,7 +20,7 @@ from cnpgen.recipes import Problem
 from cnpgen.robots.boxes import segment_box_distance
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.symbolic import SymbolicState, symbols
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

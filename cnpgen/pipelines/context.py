@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import TypeVar
 
-from cnpgen import registry
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.recipes import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema import registry
 
 Kind = TypeVar("Kind", bound=Constraint)
 

@@ -8,7 +8,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.schema import Range, field
+from cnpgen.schema.keys import Range, field
 
 
 @dataclass(frozen=True, kw_only=True)

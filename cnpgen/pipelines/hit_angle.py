@@ -7,7 +7,7 @@ import numpy as np
 from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 
 def _angle_field() -> Field:

@@ -18,7 +18,7 @@ from cnpgen.pipelines.ik import MAX_STEPS as IK_STEPS
 from cnpgen.pipelines.ik import TOLERANCE as IK_TOLERANCE
 from cnpgen.pipelines.ik import ik_step
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
 from cnpgen.robots.linalg import Scalar, dot
 from cnpgen.robots.symbolic import Vec, forward_kinematics, symbols
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -13,7 +13,7 @@ from cnpgen.pipelines.draw import uniform
 from cnpgen.pipelines.stage import Batch, Run, Stage
 from cnpgen.robots.linalg import Scalar, add, dot, gram, scale, solve, subtract
 from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
-from cnpgen.schema import Range, field
+from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

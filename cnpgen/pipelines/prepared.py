@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen import registry
 from cnpgen.constraints.constraint import EXACTNESS
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.fields import Field
@@ -18,6 +17,7 @@ from cnpgen.pipelines.piece import Block, Piece
 from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.recipes import Pipeline
 from cnpgen.robots.robot import load_robot
+from cnpgen.schema import registry
 
 HOPELESS = 1e-4  # acceptance below which a pipeline is given up, once it has had a fair chance
 FAIR_CHANCE = 100_000  # draws

@@ -9,7 +9,7 @@ from cnpgen.constraints.table import Table
 from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 
 @dataclass(frozen=True, kw_only=True)

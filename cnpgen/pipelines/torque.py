@@ -9,7 +9,7 @@ from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
 from cnpgen.robots.symbolic import inverse_dynamics, symbols
-from cnpgen.schema import field
+from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

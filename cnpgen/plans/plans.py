@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arguments import integer
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.layout import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
+from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 

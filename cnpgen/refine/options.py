@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from cnpgen.arguments import integer, number
 from cnpgen.errors import UsageError, nearest
 from cnpgen.refine import sqp
 from cnpgen.refine.criterion import OBJECTIVES
+from cnpgen.schema.arguments import integer, number
 from cnpgen.verdict.judge import check_step
 
 COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from cnpgen.arguments import integer, number
 from cnpgen.errors import UsageError
 from cnpgen.losses.schedule import BOUNDED, PUBLISHED, MetricSettings
+from cnpgen.schema.arguments import integer, number
 
 METRICS = {
     "fixed": MetricSettings(kind="fixed"),

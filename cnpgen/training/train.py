@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cnpgen.arguments import integer
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.planner.requests import problem_of
+from cnpgen.schema.arguments import integer
 from cnpgen.store.documents import plain
 from cnpgen.threads import one_thread
 from cnpgen.training.checkpoint import Checkpoints, differences

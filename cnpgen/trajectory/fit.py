@@ -15,9 +15,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arguments import numbers
 from cnpgen.errors import UsageError
 from cnpgen.recipes import TrajectorySpec
+from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary

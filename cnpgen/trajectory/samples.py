@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.arguments import numbers
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

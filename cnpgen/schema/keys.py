@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from cnpgen.units import dimension, show
+from cnpgen.schema.units import dimension, show
 
 
 @dataclass(frozen=True)
@@ -162,3 +162,6 @@ def _expected(hint: Any, unit: str) -> str:
     if hint in (float, Range):
         return dimension(unit) if hint is float else f"a range, each end {dimension(unit)}"
     return {int: "an integer", bool: "true or false", str: "a string"}.get(hint, "a table")
+
+
+NAME = "^[a-z0-9][a-z0-9-]*$"

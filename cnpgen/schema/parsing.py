@@ -8,8 +8,8 @@ from dataclasses import MISSING, dataclass
 from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
 from cnpgen.errors import nearest
-from cnpgen.schema import Key, Place, Range, keys
-from cnpgen.units import parse_number, parse_numbers, parse_range, show
+from cnpgen.schema.keys import Key, Place, Range, keys
+from cnpgen.schema.units import parse_number, parse_numbers, parse_range, show
 
 T = TypeVar("T")
 

@@ -1,0 +1,1 @@
+"""What may be written, in TOML and in Python: keys with units and bounds, kinds by name, recipe files."""

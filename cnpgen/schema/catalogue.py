@@ -1,0 +1,105 @@
+"""Recipes by name or path: those that cnpgen ships, anybody's files, and what reads and builds them."""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.schema import registry
+from cnpgen.schema.keys import Place
+from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.toml import Kind
+from cnpgen.schema.units import show
+
+Recipe = TypeVar("Recipe")
+
+_LAYOUT: dict[Kind, str] = {  # where the shipped files of a kind are
+    "problem": "problems/*/problem.toml",
+    "pipeline": "pipelines/*.toml",
+    "dataset": "datasets/*.toml",
+}
+
+
+def list_recipes(kind: Kind) -> dict[str, Path]:
+    """List the shipped recipes of a kind: name -> file, by name."""
+    folder, _, pattern = _LAYOUT[kind].partition("/")
+    files = sorted((recipes_root() / folder).glob(pattern))
+    return {file.parent.name if kind == "problem" else file.stem: file for file in files}
+
+
+def recipes_root() -> Path:
+    """Return the folder of the shipped recipes: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "_recipes"
+    return installed if installed.is_dir() else package.parent
+
+
+def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None) -> Path:
+    """Find a recipe of one of several kinds, the first one first; a ValueError says why there is none."""
+    text = os.fspath(name_or_path)
+    path = (folder or Path()) / text
+    known = {name: file for kind in reversed(kinds) for name, file in list_recipes(kind).items()}
+    is_path = isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text or os.sep in text
+    if path.is_file():
+        return path
+    if is_path:
+        hint = nearest(Path(text).stem, known)
+        raise ValueError(
+            f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
+        )
+    if text not in known:
+        hint = nearest(text, known)
+        raise ValueError(f"unknown {kinds[0]} {text!r}{hint}; known: {', '.join(known) or 'none'}")
+    return known[text]
+
+
+def load_recipe(
+    kinds: tuple[Kind, ...],
+    name_or_path: str | Path,
+    folder: Path | None,
+    build: Callable[[Path, list[str]], Recipe | None],
+) -> Recipe:
+    """Find, read and build a recipe, or raise all mistakes at once."""
+    try:
+        path = find_file(kinds, name_or_path, folder)
+    except ValueError as error:
+        raise RecipeError([str(error)]) from error
+    mistakes: list[str] = []
+    recipe = build(path, mistakes)
+    if recipe is None or mistakes:
+        raise RecipeError(mistakes)
+    return recipe
+
+
+def reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
+    """Return what reads a key that names another recipe."""
+
+    def read(value: Any, where: Place, mistakes: list[str]) -> Any:
+        if isinstance(value, str):
+            return build(find_file((kind,), value, folder), mistakes)
+        mistakes.append(where.says(f"expected a name or a path, got {show(value)}"))
+        return None
+
+    return read
+
+
+def read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any:
+    """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
+    use = value.get("use") if isinstance(value, dict) else None
+    if not isinstance(use, str):
+        mistakes.append((where / "use").says(f"missing key, expected one of {', '.join(registry.names(group))}"))
+        return None
+    try:
+        kind = registry.load(group, use)
+    except RecipeError as error:
+        mistakes.extend((where / "use").says(text) for text in error.mistakes)
+        return None
+    rest = {key: entry for key, entry in value.items() if key != "use"}
+    return parse(kind, rest, where=where, mistakes=mistakes)
+
+
+def digest_of(*parts: bytes) -> str:
+    """Return the sha256 of parts one after the other."""
+    return hashlib.sha256(b"".join(parts)).hexdigest()
