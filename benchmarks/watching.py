@@ -7,7 +7,7 @@ from pathlib import Path
 
 from common import progress
 
-from cnpgen.store.plan import default_shard_size
+from cnpgen.store.blueprint import default_shard_size
 
 MARKS = (0.1, 0.5, 1.0)  # of the rows
 

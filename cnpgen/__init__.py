@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
     from cnpgen.evaluation import Evaluation, evaluate_plans
     from cnpgen.export.plans import export_plans
-    from cnpgen.inspection import inspect_dataset
     from cnpgen.interop.omega import Omega
     from cnpgen.library import load_dataset_recipe, load_pipeline, load_problem
     from cnpgen.loader.load import load_dataset
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.obstacles import obstacle_tops
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.solving import draw_problems, load_problems
+    from cnpgen.store.inspection import inspect_dataset
     from cnpgen.store.reader import open_dataset
     from cnpgen.training.settings import TrainingSettings
     from cnpgen.training.train import train_model
@@ -66,7 +66,7 @@ _HOME = {
     "explain_plans": "refine.proof",
     "export_plans": "export.plans",
     "fit_motion": "trajectory.fit",
-    "inspect_dataset": "inspection",
+    "inspect_dataset": "store.inspection",
     "list_recipes": "schema.catalogue",
     "load_dataset": "loader.load",
     "load_dataset_recipe": "library",

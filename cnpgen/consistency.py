@@ -8,10 +8,10 @@ from pathlib import Path
 from cnpgen.errors import DatasetError
 from cnpgen.library import restore_dataset_recipe
 from cnpgen.recipes import DatasetRecipe, resolved_digest
+from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.store.check import REPLACE, Finding
-from cnpgen.store.documents import load_document, plain
+from cnpgen.store.files.documents import load_document, plain
 from cnpgen.store.layout import PLAN, STATS
-from cnpgen.store.plan import DatasetPlan
 from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
 
 

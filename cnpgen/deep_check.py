@@ -15,8 +15,8 @@ from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError, counted
 from cnpgen.robots.robot import load_robot
 from cnpgen.shard_checks import check_numbers
+from cnpgen.store.blueprint import DatasetPlan, ShardTask
 from cnpgen.store.check import DELETE, Finding
-from cnpgen.store.plan import DatasetPlan, ShardTask
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.verify.report import RowReport, merge

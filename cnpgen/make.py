@@ -15,15 +15,15 @@ from cnpgen.errors import UsageError
 from cnpgen.library import dataset_recipe_of
 from cnpgen.make_plan import dataset_folder, plan_dataset
 from cnpgen.make_shard import Job, make_shards
-from cnpgen.outcome import Outcome
 from cnpgen.pipelines.stage import BLOCK_ROWS
 from cnpgen.recipes import DatasetRecipe
 from cnpgen.schema.arguments import integer
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.check import check_documents
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize, source_date
 from cnpgen.store.mending import discard, find_damaged, made_already
-from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.outcome import Outcome
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import check_place, clear_dataset, open_workspace
 from cnpgen.workers import share_out, worker_count

@@ -11,7 +11,7 @@ from cnpgen.make_shard import Job, versions
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest, resolved, split_rows
 from cnpgen.schema.arguments import integer
-from cnpgen.store.plan import DatasetPlan, default_shard_size, load_plan
+from cnpgen.store.blueprint import DatasetPlan, default_shard_size, load_plan
 
 MAX_ROWS = 10**12
 MAX_SEED = 2**63 - 1

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from cnpgen import __version__
 from cnpgen.errors import MachineError
-from cnpgen.fields import Field
 from cnpgen.kernels.library import Backend
-from cnpgen.outcome import Outcome, merge_outcomes
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import Pipeline
-from cnpgen.store.plan import DatasetPlan, ShardTask
+from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.field import Field
+from cnpgen.store.outcome import Outcome, merge_outcomes
 from cnpgen.store.record import commit_shard
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.workspace import require_plan

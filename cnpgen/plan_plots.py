@@ -11,7 +11,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.recipes import Problem
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
-from cnpgen.store.files import machine_error
+from cnpgen.store.files.atomic import machine_error
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verify.path import PathWorld
 

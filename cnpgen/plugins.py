@@ -1,11 +1,11 @@
 """What packages with stages and constraints of their own import: these names stay here, wherever their modules are."""
 
 from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Stage
 from cnpgen.robots.symbolic import SymbolicState
 from cnpgen.schema.keys import Range, field
+from cnpgen.store.field import Field
 from cnpgen.verify.world import World
 
 __all__ = ["Batch", "Condition", "Constraint", "Context", "Field", "Range", "Stage", "SymbolicState", "World", "field"]

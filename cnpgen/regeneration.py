@@ -12,8 +12,8 @@ from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.make_shard import blocks_of, shard_columns, versions
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest
+from cnpgen.store.blueprint import REVISION, DatasetPlan, ShardTask
 from cnpgen.store.check import Finding
-from cnpgen.store.plan import REVISION, DatasetPlan, ShardTask
 from cnpgen.store.reader import StoredDataset
 
 PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.constraints.constraint import EXACTNESS
-from cnpgen.fields import Field
-from cnpgen.store.plan import DatasetPlan, ShardTask
+from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.field import Field
 from cnpgen.store.record import ShardRecord
 from cnpgen.store.statistics import FieldStatistics, field_statistics
 

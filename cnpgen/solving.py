@@ -22,7 +22,7 @@ from cnpgen.trajectory.boundary import Boundary
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from cnpgen.store.plan import DatasetPlan
+    from cnpgen.store.blueprint import DatasetPlan
 
 Array = NDArray[np.float64]
 SPLIT = "(fresh draws)"  # no split can be called so: no row of any dataset is among them

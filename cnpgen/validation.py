@@ -10,10 +10,10 @@ from cnpgen.deep_check import DeepCheck, check_rows
 from cnpgen.errors import DatasetError, counted
 from cnpgen.regeneration import Regeneration, backend_of, make_again
 from cnpgen.schema.arguments import integer
+from cnpgen.store.blueprint import DatasetPlan, load_plan, shards
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.layout import PLAN
-from cnpgen.store.places import require_folder
-from cnpgen.store.plan import DatasetPlan, load_plan, shards
+from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
 from cnpgen.verify.report import RowReport

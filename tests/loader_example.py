@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from test_store_example import PLAN, make_columns, make_shard
 
 from cnpgen.loader.batch import Batch
+from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.manifest import finalize
-from cnpgen.store.plan import save_plan, shards
 
 ALL = ("start_q", "goal_p", "clearance", "sample_id")
 

@@ -23,7 +23,7 @@ from cnpgen.refine.task import Refined
 from cnpgen.refinement import refine_plans
 from cnpgen.robots.robot import load_robot
 from cnpgen.solving import load_problems, problems_of_rows
-from cnpgen.store.files import file_sha256
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.validation import validate_dataset
 

@@ -23,8 +23,8 @@ from cnpgen.cli.plan_text import size_text
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.make_plan import MAX_ROWS
-from cnpgen.outcome import Outcome
 from cnpgen.store.check import Finding
+from cnpgen.store.outcome import Outcome
 from cnpgen.validation import ValidationReport
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
@@ -591,7 +591,7 @@ def _fail_with(monkeypatch, error):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr("cnpgen.inspection.inspect_dataset", fail)
+    monkeypatch.setattr("cnpgen.store.inspection.inspect_dataset", fail)
 
 
 @pytest.mark.parametrize(
@@ -626,7 +626,7 @@ def test_a_warning_is_a_line(run, monkeypatch):
         warnings.warn("no compiler;\n  slower", RuntimeWarning, stacklevel=1)
         raise DatasetError("gone")
 
-    monkeypatch.setattr("cnpgen.inspection.inspect_dataset", warn)
+    monkeypatch.setattr("cnpgen.store.inspection.inspect_dataset", warn)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         _, _, err = run("inspect", ".")

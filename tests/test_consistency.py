@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from cnpgen.consistency import check_recipe, check_statistics
-from cnpgen.store.documents import load_document, save_document
+from cnpgen.store.blueprint import load_plan
+from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import finalize
-from cnpgen.store.plan import load_plan
 from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION
 from cnpgen.validation import validate_dataset
 

@@ -23,7 +23,7 @@ from cnpgen.library import load_dataset_recipe, load_pipeline, load_problem
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
-from cnpgen.store.documents import plain
+from cnpgen.store.files.documents import plain
 
 KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.inspection import inspect_dataset
 from cnpgen.make import make_dataset
-from cnpgen.outcome import DensityMap, Outcome
-from cnpgen.plots import plot_dataset
+from cnpgen.store.inspection import inspect_dataset
+from cnpgen.store.outcome import DensityMap, Outcome
+from cnpgen.store.plot import plot_dataset
 from cnpgen.store.reader import open_dataset
 
 

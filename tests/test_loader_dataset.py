@@ -15,7 +15,7 @@ from cnpgen.loader import shards as shards_module
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
-from cnpgen.store.plan import save_plan, shards
+from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
 

@@ -8,9 +8,9 @@ from loader_example import columns, make
 from test_store_example import FIELDS
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
 from cnpgen.loader.load import load_dataset
 from cnpgen.loader.normalization import Normalization, make_normalization
+from cnpgen.store.field import Field
 from cnpgen.store.statistics import column_statistics
 
 

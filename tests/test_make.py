@@ -20,12 +20,12 @@ from cnpgen.make import _part as make_part
 from cnpgen.make import is_quick, make_dataset, runs
 from cnpgen.make_plan import plan_dataset
 from cnpgen.make_shard import Job, make_shards, shard_columns
-from cnpgen.outcome import Outcome
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stage import BLOCK_ROWS
+from cnpgen.store.blueprint import load_plan, shards
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.plan import load_plan, shards
+from cnpgen.store.outcome import Outcome
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import open_workspace
 from cnpgen.validation import validate_dataset

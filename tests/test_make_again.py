@@ -11,9 +11,9 @@ from tiny_datasets import digests, flip, make_tiny, snapshot
 
 from cnpgen.make import make_dataset
 from cnpgen.store import mending
+from cnpgen.store.blueprint import load_plan, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.plan import load_plan, shards
 from cnpgen.validation import validate_dataset
 
 DOCUMENTS = ("manifest.json", "stats.json", "README.md", "croissant.json")

@@ -16,7 +16,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
 from cnpgen.make import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.plan import load_plan
+from cnpgen.store.blueprint import load_plan
 from cnpgen.validation import validate_dataset
 
 

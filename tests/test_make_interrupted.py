@@ -20,8 +20,8 @@ from tiny_datasets import SHARDS, digests, make_tiny
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.library import load_dataset_recipe
 from cnpgen.make import make_dataset
-from cnpgen.outcome import Outcome
 from cnpgen.store.layout import MANIFEST
+from cnpgen.store.outcome import Outcome
 from cnpgen.validation import validate_dataset
 
 ROOT = Path(__file__).parents[1]

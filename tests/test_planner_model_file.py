@@ -13,7 +13,7 @@ from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.planner import model_file
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
-from cnpgen.planner.sealed import Content, read_sealed, seal
+from cnpgen.store.files.sealed import Content, read_sealed, seal
 
 
 @pytest.fixture(scope="module")

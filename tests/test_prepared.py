@@ -8,12 +8,12 @@ import pytest
 from conftest import SHIPPED, Prepare, needs_compiler
 
 from cnpgen.errors import RecipeError
-from cnpgen.fields import Field
-from cnpgen.outcome import Outcome, merge_outcomes
 from cnpgen.pipelines.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
 from cnpgen.pipelines.stage import BLOCK_ROWS, Batch
+from cnpgen.store.field import Field
+from cnpgen.store.outcome import Outcome, merge_outcomes
 
 CLOSE = 1e-9  # SI: what backends may differ by
 SEED = 20261121

@@ -7,7 +7,7 @@ import pytest
 
 from cnpgen import regeneration
 from cnpgen.regeneration import Regeneration, make_again
-from cnpgen.store.plan import REVISION, load_plan, shards
+from cnpgen.store.blueprint import REVISION, load_plan, shards
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from conftest import SHIPPED, TINY_SHARD, tiny_recipe
 
 from cnpgen.make import make_dataset
 from cnpgen.shard_checks import check_numbers
-from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.record import ShardRecord, load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.store.statistics import column_statistics

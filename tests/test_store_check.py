@@ -9,11 +9,11 @@ import h5py
 import pytest
 from test_store_example import PLAN, dataset, make_shard, make_shards
 
+from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, check_dataset, check_documents
-from cnpgen.store.documents import save_document
-from cnpgen.store.files import file_sha256
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.files.documents import save_document
 from cnpgen.store.manifest import finalize, load_manifest
-from cnpgen.store.plan import save_plan, shards
 
 __all__ = ["dataset"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.documents import canonical_sha256, load_document, plain, render, save_document
+from cnpgen.store.files.documents import canonical_sha256, load_document, plain, render, save_document
 
 DOCUMENT = {
     "format": "test",

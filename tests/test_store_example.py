@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cnpgen.fields import Field
-from cnpgen.outcome import DensityMap, Outcome
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, save_plan, shards
+from cnpgen.store.field import Field
 from cnpgen.store.manifest import finalize
-from cnpgen.store.plan import DatasetPlan, ShardTask, save_plan, shards
+from cnpgen.store.outcome import DensityMap, Outcome
 from cnpgen.store.record import ShardRecord, commit_shard
 
 FIELDS = (

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.store.files import committing, file_sha256, read_file, sweep, write_file
+from cnpgen.store.files.atomic import committing, file_sha256, read_file, sweep, write_file
 
 
 def failing(code: int) -> Callable[..., None]:

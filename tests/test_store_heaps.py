@@ -8,7 +8,7 @@ from test_plans import write_minimal
 
 from cnpgen.errors import DatasetError
 from cnpgen.plans import load_plans
-from cnpgen.store.heaps import check_heaps
+from cnpgen.store.files.hdf5 import check_heaps
 
 
 @pytest.fixture

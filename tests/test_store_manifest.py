@@ -15,10 +15,10 @@ from test_store_example import FIELDS, PLAN, dataset, make_columns, make_outcome
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store import manifest as manifest_module
+from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.check import check_dataset
-from cnpgen.store.files import file_sha256
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
-from cnpgen.store.plan import save_plan, shards
 from cnpgen.store.record import commit_shard
 
 __all__ = ["dataset"]

@@ -12,8 +12,7 @@ import pytest
 from test_store_example import PLAN
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.documents import save_document
-from cnpgen.store.plan import (
+from cnpgen.store.blueprint import (
     DatasetPlan,
     default_shard_size,
     from_json,
@@ -23,6 +22,7 @@ from cnpgen.store.plan import (
     shards,
     to_json,
 )
+from cnpgen.store.files.documents import save_document
 
 
 def test_a_plan_survives_json_disk_and_pickle(tmp_path: Path) -> None:

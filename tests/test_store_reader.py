@@ -14,8 +14,8 @@ from test_store_example import PLAN, dataset, make_columns, make_shard
 from cnpgen.errors import DatasetError
 from cnpgen.loader.load import load_dataset
 from cnpgen.store import intact
-from cnpgen.store.files import file_sha256
-from cnpgen.store.plan import save_plan, shards
+from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 
 __all__ = ["dataset"]

@@ -13,11 +13,11 @@ import pytest
 from test_store_example import PLAN, make_columns, make_outcome, make_shard, make_shards
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.outcome import DensityMap, Outcome, merge_outcomes, outcome_from_json
+from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.check import check_dataset
-from cnpgen.store.files import file_sha256
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize
-from cnpgen.store.plan import save_plan, shards
+from cnpgen.store.outcome import DensityMap, Outcome, merge_outcomes, outcome_from_json
 from cnpgen.store.record import (
     commit_shard,
     is_committed,

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from test_store_example import FIELDS, PLAN, make_columns
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.fields import Field
-from cnpgen.store.plan import shard_attributes, shards
+from cnpgen.store.blueprint import shard_attributes, shards
+from cnpgen.store.field import Field
 from cnpgen.store.shard import read_attributes, read_schema, read_shard, storage_dtype, write_shard
 
 TASK = shards(PLAN)[0]

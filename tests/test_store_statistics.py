@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from test_store_example import FIELDS, PLAN, make_columns
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
-from cnpgen.store.plan import shards
+from cnpgen.store.blueprint import shards
+from cnpgen.store.field import Field
 from cnpgen.store.statistics import (
     FieldStatistics,
     column_statistics,

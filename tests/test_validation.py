@@ -15,11 +15,11 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.library import load_problem
 from cnpgen.make import make_dataset
 from cnpgen.robots.robot import load_robot
+from cnpgen.store.blueprint import ShardTask, load_plan, shards
 from cnpgen.store.check import MAKE_AGAIN
-from cnpgen.store.files import file_sha256
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize
-from cnpgen.store.plan import ShardTask, load_plan, shards
 from cnpgen.store.record import load_record, save_record
 from cnpgen.store.shard import read_shard
 from cnpgen.store.statistics import column_statistics

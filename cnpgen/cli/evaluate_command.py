@@ -84,7 +84,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
 
 def _write_json(file: Path, found: "Evaluation") -> None:
     """Write one document, plan by plan: all of them at once need much memory."""
-    from cnpgen.store.documents import render
+    from cnpgen.store.files.documents import render
 
     head = render({"file": str(file), **found.summary()})
     print(head.removesuffix("\n}") + ',\n  "verdicts": [', end="")

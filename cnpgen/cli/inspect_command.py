@@ -9,9 +9,9 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
 if TYPE_CHECKING:
-    from cnpgen.fields import Field
-    from cnpgen.inspection import Inspection
-    from cnpgen.outcome import Outcome
+    from cnpgen.store.field import Field
+    from cnpgen.store.inspection import Inspection
+    from cnpgen.store.outcome import Outcome
     from cnpgen.store.statistics import FieldStatistics
 
 
@@ -33,13 +33,13 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.inspection import inspect_dataset
-    from cnpgen.store.documents import render
+    from cnpgen.store.files.documents import render
+    from cnpgen.store.inspection import inspect_dataset
 
     found = inspect_dataset(arguments.folder)
     print(render(found.to_dict()) if arguments.json else inspection_text(found))
     if arguments.plot:
-        from cnpgen.plots import plot_dataset
+        from cnpgen.store.plot import plot_dataset
 
         plot_dataset(found, arguments.plot)
         print(f"drawn: {arguments.plot}", file=sys.stderr)

@@ -26,7 +26,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.store.documents import plain, render
+    from cnpgen.store.files.documents import plain, render
 
     found = {what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)}
     print(render(plain(found)) if arguments.json else "\n\n".join(_section(*item) for item in found.items()))

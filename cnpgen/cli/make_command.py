@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from cnpgen.make import MadeDataset
-    from cnpgen.outcome import Outcome
     from cnpgen.recipes import DatasetRecipe
+    from cnpgen.store.outcome import Outcome
 
 KEPT = "finished shards are kept, run the same command again to go on"
 

@@ -7,8 +7,8 @@ from cnpgen.data_card import load_notes
 from cnpgen.describe import table
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make_plan import plan_dataset
+from cnpgen.store.blueprint import DatasetPlan, shards
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.plan import DatasetPlan, shards
 from cnpgen.store.record import pending
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.workspace import check_clearable, holds_plan, is_dataset

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
-    from cnpgen.outcome import Outcome
+    from cnpgen.store.outcome import Outcome
 
 
 class Meter:

@@ -23,7 +23,7 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
         UsageError: It is one of these.
     """
     from cnpgen.errors import UsageError
-    from cnpgen.store.kinds import file_kind
+    from cnpgen.store.paths import file_kind
     from cnpgen.store.workspace import is_dataset
 
     path = Path(recipe)

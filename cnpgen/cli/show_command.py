@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen import describe
     from cnpgen.schema import registry
-    from cnpgen.store.documents import plain, render
+    from cnpgen.store.files.documents import plain, render
 
     if arguments.recipe is None:
         group, name = (

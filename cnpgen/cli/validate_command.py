@@ -47,7 +47,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.store.documents import plain, render
+    from cnpgen.store.files.documents import plain, render
 
     report = _validate(arguments)
     if arguments.json:
@@ -80,7 +80,7 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
 def _rows(folder: Path) -> int:
     """Return how many rows there are to compute again; 0 if the plan cannot say, which validation will report."""
     from cnpgen.errors import DatasetError
-    from cnpgen.store.plan import load_plan, shards
+    from cnpgen.store.blueprint import load_plan, shards
     from cnpgen.store.record import is_committed
 
     try:

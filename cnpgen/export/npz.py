@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.export.sampled import Sampled
-from cnpgen.store.files import committing
+from cnpgen.store.files.atomic import committing
 
 
 def write_npz(path: Path, about: dict[str, NDArray[Any]], plans: Iterable[tuple[int, Sampled]]) -> None:

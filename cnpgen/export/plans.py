@@ -14,7 +14,7 @@ from cnpgen.export.npz import write_npz
 from cnpgen.export.sampled import Sampled, sample_plan
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
-from cnpgen.store.files import write_file
+from cnpgen.store.files.atomic import write_file
 
 Form = Literal["npz", "csv", "joint-trajectory"]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from cnpgen.errors import UsageError
-from cnpgen.fields import Field
-from cnpgen.store.plan import DatasetPlan
+from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True)

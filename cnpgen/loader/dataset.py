@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from cnpgen.errors import DatasetError, nearest
-from cnpgen.fields import Field
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.cut import Cut
 from cnpgen.loader.form import Form, make_form
@@ -19,7 +18,8 @@ from cnpgen.loader.position import checked_position
 from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.loader.source import Source
 from cnpgen.loader.split import Split
-from cnpgen.store.plan import DatasetPlan
+from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
 
 

@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.columns import Columns, select_columns
 from cnpgen.loader.normalization import Normalization
-from cnpgen.store.plan import DatasetPlan
+from cnpgen.store.blueprint import DatasetPlan
 
 DTYPES = ("float32", "float64")
 

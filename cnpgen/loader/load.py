@@ -8,11 +8,11 @@ from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.schema.arguments import flag
-from cnpgen.store.documents import load_document
+from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.files.documents import load_document
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import data_fingerprint
-from cnpgen.store.plan import DatasetPlan
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.statistics import FieldStatistics, statistics_from_json
 from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
+from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
 
 Floats = NDArray[np.float64]

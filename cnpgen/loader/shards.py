@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
 from cnpgen.loader.columns import tail
-from cnpgen.store.files import file_sha256
+from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import AGAIN, digest_problem, size_problem
 from cnpgen.store.shard import Placement, read_attributes, read_placements, read_shard
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.constraints.constraint import EXACTNESS, End
-from cnpgen.fields import Field
 from cnpgen.pipelines.collision import sample_tops
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.recipes import Problem
 from cnpgen.robots.linalg import Scalar, dot, subtract
 from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

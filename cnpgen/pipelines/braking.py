@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.constraints.table import Table
-from cnpgen.fields import Field
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
@@ -22,6 +21,7 @@ from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.robots.linalg import Scalar, add, dot, scale
 from cnpgen.robots.symbolic import Vec, bias_acceleration, forward_kinematics, symbols, tip_velocity
 from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from cnpgen.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.errors import RecipeError
-from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.recipes import Problem
@@ -21,6 +20,7 @@ from cnpgen.robots.boxes import segment_box_distance
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

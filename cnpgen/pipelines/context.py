@@ -5,11 +5,11 @@ from typing import TypeVar
 
 from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
-from cnpgen.fields import Field
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.recipes import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
+from cnpgen.store.field import Field
 
 Kind = TypeVar("Kind", bound=Constraint)
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.errors import RecipeError
-from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import Range, field
+from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True, kw_only=True)

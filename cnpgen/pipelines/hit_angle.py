@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
 
 
 def _angle_field() -> Field:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.fields import Field
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.hitting_limits import held_step, within_limits
@@ -19,6 +18,7 @@ from cnpgen.pipelines.ik import TOLERANCE as IK_TOLERANCE
 from cnpgen.pipelines.ik import ik_step
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True, kw_only=True)

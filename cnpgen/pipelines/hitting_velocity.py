@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
 from cnpgen.robots.linalg import Scalar, dot
 from cnpgen.robots.symbolic import Vec, forward_kinematics, symbols
 from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.errors import RecipeError
-from cnpgen.fields import Field
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.draw import uniform
@@ -14,6 +13,7 @@ from cnpgen.pipelines.stage import Batch, Run, Stage
 from cnpgen.robots.linalg import Scalar, add, dot, gram, scale, solve, subtract
 from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
 from cnpgen.schema.keys import Range, field
+from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.fields import Field
-from cnpgen.outcome import Outcome
 from cnpgen.pipelines.stage import Batch
 from cnpgen.pipelines.tally import Tally
+from cnpgen.store.field import Field
+from cnpgen.store.outcome import Outcome
 
 
 @dataclass(frozen=True)

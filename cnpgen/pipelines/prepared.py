@@ -9,7 +9,6 @@ import numpy as np
 
 from cnpgen.constraints.constraint import EXACTNESS
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.fields import Field
 from cnpgen.kernels.library import Backend, KernelLibrary, problem_identity
 from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
@@ -18,6 +17,7 @@ from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.recipes import Pipeline
 from cnpgen.robots.robot import load_robot
 from cnpgen.schema import registry
+from cnpgen.store.field import Field
 
 HOPELESS = 1e-4  # acceptance below which a pipeline is given up, once it has had a fair chance
 FAIR_CHANCE = 100_000  # draws

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.constraints.table import Table
-from cnpgen.fields import Field
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.fields import Field
+from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.pipelines.context import Context

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.fields import Field
-from cnpgen.outcome import DensityMap, Outcome
 from cnpgen.pipelines.stage import Array, Batch
+from cnpgen.store.field import Field
+from cnpgen.store.outcome import DensityMap, Outcome
 
 CELLS = 24  # along each side of a density map
 

@@ -13,10 +13,10 @@ from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.network.architecture import Architecture
 from cnpgen.network.features import BLOCKS, Features
 from cnpgen.planner.model import Meaning, Model
-from cnpgen.planner.sealed import Content, read_sealed, write_sealed
 from cnpgen.plans.problem import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
-from cnpgen.store.places import require_file
+from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
+from cnpgen.store.paths import require_file
 
 KIND, VERSION = "cnpgen-model", 1
 

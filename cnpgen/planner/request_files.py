@@ -10,9 +10,9 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
 from cnpgen.planner.requests import ASKED, CONTEXT, Requests, boundary_in, check_drawing, check_problem
 from cnpgen.plans.load import stored_problem
-from cnpgen.store.heaps import opened_foreign_hdf5
-from cnpgen.store.places import require_file
-from cnpgen.store.plan import load_plan
+from cnpgen.store.blueprint import load_plan
+from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+from cnpgen.store.paths import require_file
 from cnpgen.store.shard import FORMAT
 
 

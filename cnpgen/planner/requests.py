@@ -14,8 +14,8 @@ from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
 from cnpgen.plans.layout import BOUNDARY
 from cnpgen.plans.problem import ProblemRecord
-from cnpgen.store.documents import canonical_sha256
-from cnpgen.store.plan import DatasetPlan
+from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.trajectory.boundary import Boundary
 

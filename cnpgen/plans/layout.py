@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from cnpgen.fields import Field
+from cnpgen.store.field import Field
 
 FORMAT = "cnpgen-plans"
 FORMAT_VERSION = 1

@@ -16,9 +16,8 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
 from cnpgen.recipes import Problem
-from cnpgen.store.heaps import opened_foreign_hdf5
-from cnpgen.store.kinds import file_kind
-from cnpgen.store.places import require_file
+from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

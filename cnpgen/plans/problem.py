@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.library import restore_dataset_recipe
 from cnpgen.recipes import Problem, TrajectorySpec, resolved
-from cnpgen.store.documents import canonical_sha256, plain
+from cnpgen.store.files.documents import canonical_sha256, plain
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -12,9 +12,10 @@ from cnpgen.errors import UsageError
 from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, NOTES, plan_fields
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
-from cnpgen.store.files import write_file
-from cnpgen.store.kinds import PLANS, file_kind
-from cnpgen.store.shard import create_hdf5, field_attributes
+from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.hdf5 import create_hdf5
+from cnpgen.store.paths import PLANS, file_kind
+from cnpgen.store.shard import field_attributes
 
 
 def save_plans(path: str | Path, plans: Plans) -> None:

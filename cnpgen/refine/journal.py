@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, UsageError, counted
 from cnpgen.refine.task import Outcome, Refined
-from cnpgen.store.files import machine_error
+from cnpgen.store.files.atomic import machine_error
 
 MAGIC = b"cnpgen journal 1\n"
 LONGEST = 80  # characters of two values that a message shows

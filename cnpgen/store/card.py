@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cnpgen.fields import Field
+from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
 from cnpgen.store.summary import Summary
 

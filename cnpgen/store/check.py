@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
-from cnpgen.store.files import file_sha256
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shard_attributes, shards
+from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 from cnpgen.store.manifest import data_fingerprint, load_manifest
-from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shard_attributes, shards
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import (
     FORMAT,

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files import file_sha256
+from cnpgen.store.files.atomic import file_sha256
 
 AGAIN = "run the same make-dataset command again"
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.fields import Field
+from cnpgen.store.blueprint import DatasetPlan, load_plan
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
-from cnpgen.store.documents import load_document, plain, render, save_document
-from cnpgen.store.files import file_sha256, sweep, write_file
+from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import file_sha256, sweep, write_file
+from cnpgen.store.files.documents import load_document, plain, render, save_document
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
-from cnpgen.store.plan import DatasetPlan, load_plan
 from cnpgen.store.summary import Summary, stats_document, summarise
 
 FORMAT = "cnpgen-dataset"

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files import machine_error
+from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.plan import DatasetPlan, ShardTask
 from cnpgen.store.record import check_committed
 
 MOST_THREADS = 8

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, nearest
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.places import require_folder
-from cnpgen.store.plan import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard, storage_dtype
 from cnpgen.store.summary import summarise, unfinished

@@ -8,11 +8,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError
-from cnpgen.outcome import Outcome, outcome_from_json
-from cnpgen.store.documents import load_document, save_document
-from cnpgen.store.files import file_sha256
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, shard_attributes, shards
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import WORK
-from cnpgen.store.plan import DatasetPlan, ShardTask, shard_attributes, shards
+from cnpgen.store.outcome import Outcome, outcome_from_json
 from cnpgen.store.shard import write_shard
 from cnpgen.store.statistics import FieldStatistics, column_statistics, statistics_from_json
 

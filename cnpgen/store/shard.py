@@ -3,11 +3,9 @@
 The bytes of a shard depend on its rows, fields and attributes only, within one version of HDF5: no time, host or path.
 """
 
-import errno
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, nearest
-from cnpgen.fields import Field
-from cnpgen.store.files import committing, machine_error
+from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import committing
+from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
 
 FORMAT = "cnpgen-shard"
 FORMAT_VERSION = 1
 _STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
-_DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # what h5py raises on broken files
-_SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
 
 
 def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
@@ -128,43 +125,6 @@ def _encode(
             dataset.attrs.update(field_attributes(field))
         file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSION, **attributes})
     return buffer.getbuffer()
-
-
-def create_hdf5(buffer: io.BytesIO) -> Any:
-    """Create an HDF5 file in ``buffer``; wrap it in ``h5py.File``.
-
-    The file format is pinned. The root group stores no times, which ``h5py.File`` has only lately learnt to leave out.
-    Datasets start at multiples of 64 bytes, so that they can be mapped into memory as aligned arrays.
-    """
-    from h5py import h5f, h5fd, h5p
-
-    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
-    creation.set_obj_track_times(False)
-    access.set_fileobj_driver(h5fd.fileobj_driver, buffer)
-    access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
-    access.set_alignment(1, 64)
-    return h5f.create(b"shard", h5f.ACC_TRUNC, creation, access)
-
-
-@contextmanager
-def opened_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file for reading, without handles that outlive the block and could be shared by processes.
-
-    Raises:
-        DatasetError: The file is missing, damaged or cut off, found out on opening or by what the block reads.
-        MachineError: The system would not let us read it.
-    """
-    import h5py
-
-    if not path.is_file():
-        raise DatasetError(f"{path} is missing")
-    try:
-        with h5py.File(path, "r", locking="best-effort") as file:
-            yield file
-    except _DAMAGE as error:
-        if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
-            raise machine_error("read", path, error) from error
-        raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
 def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:

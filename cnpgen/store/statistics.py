@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
+from cnpgen.store.field import Field
 
 Floats = NDArray[np.float64]
 N_BINS = 64

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.outcome import Outcome, densities_to_json, merge_outcomes
-from cnpgen.store.plan import DatasetPlan, ShardTask, shards
+from cnpgen.store.blueprint import DatasetPlan, ShardTask, shards
+from cnpgen.store.outcome import Outcome, densities_to_json, merge_outcomes
 from cnpgen.store.record import ShardRecord, load_committed
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 

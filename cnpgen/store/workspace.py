@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files import machine_error, read_file, sweep
+from cnpgen.store.blueprint import INFORMATIONAL, DatasetPlan, load_plan, to_json, write_plan
+from cnpgen.store.files.atomic import machine_error, read_file, sweep
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
-from cnpgen.store.plan import INFORMATIONAL, DatasetPlan, load_plan, to_json, write_plan
 
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
 _SHARD = re.compile(r"shard-\d{5,}\.(h5|json)")

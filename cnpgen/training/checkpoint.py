@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.planner.sealed import read_sealed, write_sealed
+from cnpgen.store.files.sealed import read_sealed, write_sealed
 from cnpgen.training.state import State, from_content, to_content
 
 KIND, VERSION = "cnpgen-checkpoint", 1

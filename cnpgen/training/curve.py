@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.store.files import machine_error
+from cnpgen.store.files.atomic import machine_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

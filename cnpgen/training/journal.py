@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cnpgen.store.files import machine_error, write_file
+from cnpgen.store.files.atomic import machine_error, write_file
 
 OURS = {"step", "epoch", "learning_rate", "seconds", "lost"}  # keys of the first line of every log
 

@@ -15,7 +15,7 @@ from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
-from cnpgen.store.documents import plain
+from cnpgen.store.files.documents import plain
 from cnpgen.training.margins import suggested_margins
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.run import Run

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.planner.sealed import Content
+from cnpgen.store.files.sealed import Content
 from cnpgen.training.adam import Adam, start_adam
 from cnpgen.training.clipping import Clipping
 

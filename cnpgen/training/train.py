@@ -11,7 +11,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.planner.requests import problem_of
 from cnpgen.schema.arguments import integer
-from cnpgen.store.documents import plain
+from cnpgen.store.files.documents import plain
 from cnpgen.threads import one_thread
 from cnpgen.training.checkpoint import Checkpoints, differences
 from cnpgen.training.journal import Journal

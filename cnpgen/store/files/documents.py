@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files import read_file, write_file
+from cnpgen.store.files.atomic import read_file, write_file
 
 _BLANK = "0" * 64
 _SCALARS = frozenset({int, bool, str, type(None)})  # types that are JSON's own, whatever the value

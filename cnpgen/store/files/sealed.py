@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files import read_file, write_file
+from cnpgen.store.files.atomic import read_file, write_file
 
 BLOCK = 512  # bytes of the seal
 _SEAL = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")

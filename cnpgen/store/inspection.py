@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.fields import Field
-from cnpgen.outcome import Outcome, densities_to_json
+from cnpgen.store.blueprint import DatasetPlan, load_plan, shards
 from cnpgen.store.check import check_documents
-from cnpgen.store.documents import plain
+from cnpgen.store.field import Field
+from cnpgen.store.files.documents import plain
 from cnpgen.store.layout import DOCUMENTS, MANIFEST, PLAN
-from cnpgen.store.places import require_folder
-from cnpgen.store.plan import DatasetPlan, load_plan, shards
+from cnpgen.store.outcome import Outcome, densities_to_json
+from cnpgen.store.paths import require_folder
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise, unfinished
 from cnpgen.store.workspace import is_dataset

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.fields import Field
-from cnpgen.inspection import Inspection
-from cnpgen.outcome import DensityMap
-from cnpgen.store.files import machine_error
+from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.inspection import Inspection
+from cnpgen.store.outcome import DensityMap
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.statistics import FieldStatistics
 

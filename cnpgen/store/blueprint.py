@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError, nearest
-from cnpgen.fields import Field
-from cnpgen.store.documents import canonical_sha256, load_document, plain, save_document
+from cnpgen.store.field import Field
+from cnpgen.store.files.documents import canonical_sha256, load_document, plain, save_document
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
 FORMAT = "cnpgen-plan"

@@ -1,0 +1,71 @@
+"""What users point at: the folder of a dataset, a file. What is not there is a mistake in an argument, not damage."""
+
+import re
+from pathlib import Path
+
+from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.store.workspace import is_dataset
+
+
+def require_folder(folder: Path) -> None:
+    """Refuse what is no folder.
+
+    Args:
+        folder: What should be the folder of a dataset.
+
+    Raises:
+        UsageError: It is not there, or is a file.
+    """
+    if not folder.is_dir():
+        what = "a file" if folder.exists() else "not there"
+        raise UsageError(f"{folder} is {what}, expected the folder of a dataset")
+
+
+def require_file(path: Path, what: str, *, of_dataset: str = "") -> None:
+    """Refuse what is no file.
+
+    Args:
+        path: What should be a file.
+        what: What it should hold: "a file of plans".
+        of_dataset: What to do if it is the folder of a dataset instead.
+
+    Raises:
+        UsageError: It is not there, or is a folder.
+    """
+    if path.is_dir():
+        found, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
+        raise UsageError(f"{path} is {found}, expected {what}{hint and f': {hint}'}")
+    if not path.exists():
+        raise UsageError(f"{path} is not there, expected {what}")
+
+
+HDF5 = b"\x89HDF\r\n\x1a\n"
+_HEAD = re.compile(rb"cnpgen[- ]([a-z]+) [0-9]")  # of models and checkpoints, which are sealed, and of journals
+PLANS = "a file of plans"
+_SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
+
+
+def file_kind(path: Path) -> str:
+    """Say what a file is: "a model of cnpgen", "a file of plans"; nothing where that is not known."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except OSError:
+        return ""
+    if found := _HEAD.match(head):
+        return f"a {found[1].decode()} of cnpgen"
+    return _hdf5_kind(path) if head.startswith(HDF5) else ""
+
+
+def _hdf5_kind(path: Path) -> str:
+    from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+
+    try:
+        with opened_foreign_hdf5(path) as file:
+            said, names = file.attrs.get("format"), set(file)
+    except (DatasetError, MachineError):
+        return "an HDF5 file"
+    said = said.decode(errors="replace") if isinstance(said, bytes) else said
+    if said is None and {"path_control_points", "rate_control_points"} <= names:  # others' files need not say it
+        return PLANS
+    return _SAID.get(str(said), "an HDF5 file")
