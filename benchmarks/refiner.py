@@ -25,6 +25,7 @@ from common import arguments, median, progress, report, table, verdict
 from refiner_problems import Made, grid_of_hits, like_a_networks, make_each
 from slsqp import minimise_slsqp
 
+from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.problem import open_problem
 from cnpgen.refine.engine import load_refiner, prepare, tasks_of
@@ -35,7 +36,6 @@ from cnpgen.refine.refiner import Passes, Refiner, default_passes
 from cnpgen.refine.sqp import Settings
 from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems
-from cnpgen.threads import one_thread
 from cnpgen.trajectory.motion import Motion
 
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
 
+from cnpgen.machine.threads import one_thread
 from cnpgen.make import make_dataset
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import problem_of, read_rows
 from cnpgen.refinement import refine_plans
-from cnpgen.threads import one_thread
 from cnpgen.training import step as parts
 from cnpgen.training.prepare import begin_run, prepare_run
 from cnpgen.training.settings import Length, TrainingSettings

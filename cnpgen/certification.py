@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
 from cnpgen.recipes import DatasetRecipe, Problem, TrajectorySpec
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.store.field import Field
-from cnpgen.threads import one_thread
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.certification import PlanCheck, check_plans
 from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError, counted
+from cnpgen.machine.workers import share_out
 from cnpgen.robots.robot import load_robot
 from cnpgen.shard_checks import check_numbers
 from cnpgen.store.blueprint import DatasetPlan, ShardTask
@@ -21,7 +22,6 @@ from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.verify.report import RowReport, merge
 from cnpgen.verify.rows import verify_rows
-from cnpgen.workers import share_out
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cnpgen.threads import users_environment
+from cnpgen.machine.threads import users_environment
 
 NEEDED = {  # module -> the project on PyPI that has it
     "numpy": "numpy",

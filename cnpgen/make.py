@@ -13,6 +13,7 @@ from cnpgen.certification import certified
 from cnpgen.data_card import load_notes
 from cnpgen.errors import UsageError
 from cnpgen.library import dataset_recipe_of
+from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.make_plan import dataset_folder, plan_dataset
 from cnpgen.make_shard import Job, make_shards
 from cnpgen.pipelines.stage import BLOCK_ROWS
@@ -26,7 +27,6 @@ from cnpgen.store.mending import discard, find_damaged, made_already
 from cnpgen.store.outcome import Outcome
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import check_place, clear_dataset, open_workspace
-from cnpgen.workers import share_out, worker_count
 
 ALONE = {
     "compiled": 200_000,

@@ -7,7 +7,8 @@ from typing import Any
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import dataset_recipe_of
-from cnpgen.make_shard import Job, versions
+from cnpgen.machine.versions import versions
+from cnpgen.make_shard import Job
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest, resolved, split_rows
 from cnpgen.schema.arguments import integer

@@ -1,21 +1,18 @@
 """Making shards: their blocks, the spot check by Pinocchio and Coal, the commit."""
 
-import platform
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen import __version__
 from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend
+from cnpgen.machine.versions import versions
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import Pipeline
@@ -170,17 +167,3 @@ def _prepared(job: Job) -> PreparedPipeline:
             job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.plan.dtype
         )
     return _PREPARED[key]
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Versions of cnpgen, Python and the libraries that make rows."""
-    names = ("numpy", "casadi", "pin", "coal", "h5py", "joblib")
-    machine = f"{platform.system()} {platform.machine()}"
-    found = {"cnpgen": __version__, "python": platform.python_version(), "platform": machine}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen import __version__
 from cnpgen.errors import counted
+from cnpgen.machine.threads import one_thread
+from cnpgen.machine.versions import __version__
+from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.engine import prepare, refine_part
 from cnpgen.refine.journal import Journal, open_journal
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.task import Outcome, Refined
-from cnpgen.threads import one_thread
-from cnpgen.workers import share_out, worker_count
 
 FORMAT = "cnpgen-refinement"
 FORMAT_VERSION = 1

@@ -9,7 +9,8 @@ import numpy as np
 from cnpgen.consistency import restored
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
-from cnpgen.make_shard import blocks_of, shard_columns, versions
+from cnpgen.machine.versions import versions
+from cnpgen.make_shard import blocks_of, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.recipes import DatasetRecipe, recipe_digest
 from cnpgen.store.blueprint import REVISION, DatasetPlan, ShardTask

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen import doctor, threads
+from cnpgen import doctor
 from cnpgen.doctor import check_machine, vector_instructions
 from cnpgen.kernels.compiled import find_compiler
+from cnpgen.machine import threads
 
 
 @pytest.fixture

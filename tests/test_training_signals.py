@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from cnpgen.training import signals
-from cnpgen.training.signals import signals_wait
+from cnpgen.machine import signals
+from cnpgen.machine.signals import signals_wait
 
 
 def receive(count: int, done: list[int | None]) -> None:

@@ -14,7 +14,7 @@ import pytest
 from tiny_datasets import digests, make_tiny
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.workers import _signals_held, share_out, worker_count
+from cnpgen.machine.workers import _signals_held, share_out, worker_count
 
 ROOT = Path(__file__).parents[1]
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
@@ -57,7 +57,7 @@ def test_tasks_are_fetched_as_they_are_needed():
 
 KILLED = """
 import os, signal, sys, time
-from cnpgen.workers import share_out
+from cnpgen.machine.workers import share_out
 
 if __name__ == "__main__":
     for _ in share_out(time.sleep, [0.0, 0.0, 60.0, 60.0], 2):
@@ -132,7 +132,7 @@ def test_a_signal_that_comes_while_workers_start_is_only_delayed():
 
 CHILD = """
 import os, sys, time
-from cnpgen.workers import share_out
+from cnpgen.machine.workers import share_out
 def pid(number):
     time.sleep(number)
     return os.getpid()

@@ -28,7 +28,7 @@ from cnpgen.cli import (
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
-from cnpgen.threads import prefer_one_thread
+from cnpgen.machine.threads import prefer_one_thread
 
 _COMMANDS = (
     make_command,

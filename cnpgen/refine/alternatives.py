@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.machine.signals import Received, signals_held_back
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.programme import Programme
-from cnpgen.refine.signals import Received, signals_held_back
 from cnpgen.refine.sqp import Result, Settings
 from cnpgen.refine.transcription import Transcription
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen import __version__
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.schedule import suggested_weights
+from cnpgen.machine.versions import __version__
 from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit

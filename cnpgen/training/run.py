@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.quadrature import rotating_shift
+from cnpgen.machine.signals import signals_wait
 from cnpgen.network.features import Features
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.plans.problem import ProblemRecord
@@ -18,7 +19,6 @@ from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.journal import Journal
 from cnpgen.training.rows import Rows
 from cnpgen.training.schedule import learning_rate
-from cnpgen.training.signals import signals_wait
 from cnpgen.training.state import Best, State, Sums
 from cnpgen.training.step import Learner
 from cnpgen.training.step_rows import StepRows

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.machine.threads import one_thread
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.planner.requests import problem_of
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.documents import plain
-from cnpgen.threads import one_thread
 from cnpgen.training.checkpoint import Checkpoints, differences
 from cnpgen.training.journal import Journal
 from cnpgen.training.places import CHECKPOINT, LOG, check_beside, check_out, sweep_beside

@@ -1,0 +1,1 @@
+"""The machine under the process: threads, signals, worker processes, versions."""

@@ -1,0 +1,22 @@
+"""The version of cnpgen, and of what it computes with."""
+
+from functools import cache
+
+__version__ = "0.1.0"
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of cnpgen, Python and the libraries that make rows."""
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    names = ("numpy", "casadi", "pin", "coal", "h5py", "joblib")
+    machine = f"{platform.system()} {platform.machine()}"
+    found = {"cnpgen": __version__, "python": platform.python_version(), "platform": machine}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
