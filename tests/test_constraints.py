@@ -15,8 +15,9 @@ from cnpgen.constraints.joint import JointAcceleration, JointPosition, JointTorq
 from cnpgen.constraints.table import Table
 from cnpgen.constraints.vertical import Vertical
 from cnpgen.library import load_problem
-from cnpgen.recipes import LimitSpec, Problem, RobotSpec
+from cnpgen.recipes import Problem
 from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names

@@ -12,9 +12,10 @@ import pytest
 from cnpgen.kernels.interpreted import InterpretedKernel
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.library import load_problem
-from cnpgen.recipes import LimitSpec, Problem, RobotSpec
+from cnpgen.recipes import Problem
 from cnpgen.robots.boxes import segment_box_distance, segment_box_separation, upright_box_separation
 from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.robots.symbolic import (
     bias_acceleration,
     forward_kinematics,

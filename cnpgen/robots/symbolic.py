@@ -15,8 +15,8 @@ from cnpgen.robots.chain import Chain, Joint
 from cnpgen.robots.linalg import Scalar, add, cross, dot, scale, subtract
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Obstacle
     from cnpgen.robots.robot import Robot
+    from cnpgen.robots.spec import Obstacle
 
 Vec = list[Scalar]
 

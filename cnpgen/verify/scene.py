@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Obstacle
+    from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
 Point = Sequence[float]
