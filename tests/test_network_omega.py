@@ -7,8 +7,8 @@ from test_trajectory_slopes import random_boundary
 
 from cnpgen.network.omega import control_points, pull_back
 from cnpgen.network.tasks import SHORTEST_TIME, Tasks, expected_time
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, anchor_line
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import clamped_knots
 
 SPEC, N, JOINTS = TrajectorySpec(), 5, 3

@@ -12,7 +12,6 @@ from example_refiner import library, refine, refiner, refiner_of, task, tops, ve
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.refine import sqp
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
@@ -29,6 +28,7 @@ from cnpgen.refine.transcription import Stage, Transcription
 from cnpgen.robots.symbolic import SymbolicState
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import chebyshev
 from cnpgen.verdict import Verdict
 from cnpgen.verify.world import World

@@ -8,8 +8,8 @@ import pytest
 from scipy.interpolate import BSpline
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble, goal_points, start_points
+from cnpgen.trajectory.spec import TrajectorySpec
 
 N, JOINTS = 5, 6
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.fit import fit_motion, largest_error
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.samples import sampled_boundary
+from cnpgen.trajectory.spec import TrajectorySpec
 
 SPEC = TrajectorySpec()
 Curve = Callable[[np.ndarray], np.ndarray]

@@ -8,9 +8,9 @@ from scipy.integrate import quad
 from scipy.interpolate import BSpline
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.motion import Motion, States
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import clamped_knots, extremes
 
 FIELDS = tuple(States.__annotations__)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, goal_points, start_points
 from cnpgen.trajectory.slopes import boundary_slopes
+from cnpgen.trajectory.spec import TrajectorySpec
 
 STEP = 1e-6
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.schema.arguments import integer
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.network.tasks import Tasks
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import goal_points, start_points
 from cnpgen.trajectory.slopes import boundary_slopes
+from cnpgen.trajectory.spec import TrajectorySpec
 
 Array = NDArray[Any]
 

@@ -15,8 +15,8 @@ from cnpgen.robots.symbolic import Vec, symbols
 from cnpgen.trajectory.spline import end_derivatives
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import TrajectorySpec
     from cnpgen.robots.robot import Robot
+    from cnpgen.trajectory.spec import TrajectorySpec
 
 FIXED_AT_GOAL = 2  # control points: goal accelerations are free
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.library import restore_dataset_recipe
-from cnpgen.recipes import Problem, TrajectorySpec, resolved
+from cnpgen.recipes import Problem, resolved
 from cnpgen.store.files.documents import canonical_sha256, plain
+from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
 
 Array = NDArray[np.float64]

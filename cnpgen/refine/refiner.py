@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.recipes import Problem, TrajectorySpec
+from cnpgen.recipes import Problem
 from cnpgen.refine import starts
 from cnpgen.refine.alternatives import minimise_with
 from cnpgen.refine.bounds import Bounds, BoundsTemplate, Tightening
@@ -20,6 +20,7 @@ from cnpgen.refine.sqp import DEFAULT, Result, Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Attempt, Outcome, Task
 from cnpgen.refine.transcription import Stage, Transcription
+from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

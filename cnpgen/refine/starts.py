@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary, anchor_line
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]

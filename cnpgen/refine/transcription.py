@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.refine.criterion import Criterion
 from cnpgen.refine.grid import Bases, Grid
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.slopes import boundary_slopes
+from cnpgen.trajectory.spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -12,12 +12,12 @@ from cnpgen.network.architecture import Architecture
 from cnpgen.network.forward import backward, forward
 from cnpgen.network.omega import ControlPoints, control_points, pull_back
 from cnpgen.planner.landing import Landing
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.training.adam import Adam
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.imitation import imitation_loss
 from cnpgen.training.rows import Rows
 from cnpgen.training.settings import TrainingSettings
+from cnpgen.trajectory.spec import TrajectorySpec
 
 Array = NDArray[Any]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 
 Array = NDArray[np.float64]

@@ -16,11 +16,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, clamped_knots
 
 Array = NDArray[np.float64]

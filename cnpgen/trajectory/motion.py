@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import TrajectorySpec
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, edges_around, extremes, graded_edges, horner, pick, pieces
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import TrajectorySpec
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import end_derivatives
 
 Array = NDArray[Any]
