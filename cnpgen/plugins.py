@@ -3,9 +3,9 @@
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Stage
-from cnpgen.robots.symbolic import SymbolicState
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.state import SymbolicState
 from cnpgen.verify.world import World
 
 __all__ = ["Batch", "Condition", "Constraint", "Context", "Field", "Range", "Stage", "SymbolicState", "World", "field"]

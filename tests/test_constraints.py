@@ -18,9 +18,9 @@ from cnpgen.library import load_problem
 from cnpgen.recipes import Problem
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.robots.spec import LimitSpec, RobotSpec
-from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
+from cnpgen.symbolic.state import SymbolicState, symbols
 from cnpgen.verify.world import World
 
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")

@@ -18,8 +18,8 @@ from cnpgen.kernels.tape import Grid, tape_from_function
 from cnpgen.losses.published import published
 from cnpgen.losses.stage import HeldState
 from cnpgen.losses.terms import constraint_term
-from cnpgen.robots.boxes import signed_segment_box_distance
-from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.symbolic.boxes import signed_segment_box_distance
+from cnpgen.symbolic.state import SymbolicState, symbols
 
 Array = np.ndarray
 

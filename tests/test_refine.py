@@ -25,7 +25,7 @@ from cnpgen.refine.sqp import Settings, minimise
 from cnpgen.refine.stage import stage_jacobian, stage_values
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.refine.transcription import Stage, Transcription
-from cnpgen.robots.symbolic import SymbolicState
+from cnpgen.symbolic.state import SymbolicState
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spec import TrajectorySpec

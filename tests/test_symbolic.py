@@ -13,16 +13,10 @@ from cnpgen.kernels.interpreted import InterpretedKernel
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.library import load_problem
 from cnpgen.recipes import Problem
-from cnpgen.robots.boxes import segment_box_distance, segment_box_separation, upright_box_separation
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.robots.spec import LimitSpec, RobotSpec
-from cnpgen.robots.symbolic import (
-    bias_acceleration,
-    forward_kinematics,
-    inverse_dynamics,
-    symbols,
-    tip_velocity,
-)
+from cnpgen.symbolic.boxes import segment_box_distance, segment_box_separation, upright_box_separation
+from cnpgen.symbolic.state import bias_acceleration, forward_kinematics, inverse_dynamics, symbols, tip_velocity
 
 STATES = 60
 

@@ -316,7 +316,7 @@ def test_the_verdict_shares_no_code_with_the_refiner():
     script = """
 import sys
 import cnpgen.plan_plots, cnpgen.verdict, cnpgen.verify.path
-banned = ("cnpgen.kernels", "cnpgen.refine", "cnpgen.robots.symbolic", "cnpgen.robots.linalg", "cnpgen.robots.boxes")
+banned = ("cnpgen.kernels", "cnpgen.refine", "cnpgen.symbolic.state", "cnpgen.symbolic.linalg", "cnpgen.symbolic.boxes")
 heavy = ("casadi", "pinocchio", "coal", "matplotlib", "scipy", "h5py")
 found = [name for name in sys.modules if name.startswith(banned) or name in heavy]
 assert not found, found

@@ -9,7 +9,7 @@ from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.robots.symbolic import SymbolicState
+    from cnpgen.symbolic.state import SymbolicState
     from cnpgen.verify.world import World
 
 
@@ -26,13 +26,13 @@ class RobotClearance(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the signed distance of every moving segment from every obstacle [m]."""
-        from cnpgen.robots.boxes import segment_box_separation
+        from cnpgen.symbolic.boxes import segment_box_separation
 
         return self._clear([segment_box_separation(a, b, box) for a, b in state.segments for box in state.boxes])
 
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State distances that are easier to descend: inside, the depth of the middle of what is inside [m]."""
-        from cnpgen.robots.boxes import signed_segment_box_distance as distance
+        from cnpgen.symbolic.boxes import signed_segment_box_distance as distance
 
         return self._clear([distance(a, b, box, hold=state.hold) for a, b in state.segments for box in state.boxes])
 
@@ -55,7 +55,7 @@ class ObjectContact(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the separation of the object from every obstacle [m]."""
-        from cnpgen.robots.boxes import upright_box_separation
+        from cnpgen.symbolic.boxes import upright_box_separation
 
         kin, size = state.kinematics, state.object_size or (0.0, 0.0, 0.0)
         return self._shallow([upright_box_separation(kin.tip, kin.rotation, size, box) for box in state.boxes])

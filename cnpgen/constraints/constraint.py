@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.robots.symbolic import SymbolicState
+    from cnpgen.symbolic.state import SymbolicState
     from cnpgen.verify.world import World
 
 End = Literal["start", "goal"]

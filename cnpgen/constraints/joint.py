@@ -13,7 +13,7 @@ from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.robots.symbolic import SymbolicState
+    from cnpgen.symbolic.state import SymbolicState
     from cnpgen.verify.world import World
 
 

@@ -10,7 +10,7 @@ from cnpgen.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
-    from cnpgen.robots.symbolic import SymbolicState
+    from cnpgen.symbolic.state import SymbolicState
     from cnpgen.verify.world import World
 
 FUNNEL = (0.1, 0.3)  # phases between which a motion that starts off the table must come down to it

@@ -152,7 +152,7 @@ def _store(path: Path, data: bytes) -> None:
 def _shared_digest() -> str:
     """Digest of what builders of several folders use: kernels are rebuilt when it changes."""
     root = Path(__file__).parents[1]
-    return _digest_of(*(root / folder for folder in ("robots", "kernels", "constraints", "trajectory")))
+    return _digest_of(*(root / folder for folder in ("robots", "symbolic", "kernels", "constraints", "trajectory")))
 
 
 def _source_digest(builder: Callable[..., Any]) -> str:
@@ -167,8 +167,8 @@ def _source_digest(builder: Callable[..., Any]) -> str:
 def _digest_of(*folders: Path) -> str:
     digest = hashlib.sha256()
     for folder in folders:
-        for path in sorted(folder.glob("*.py")):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 

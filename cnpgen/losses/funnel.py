@@ -10,7 +10,7 @@ from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import UsageError
 from cnpgen.losses.stage import has_funnel, stated
 from cnpgen.recipes import Problem
-from cnpgen.robots.symbolic import SymbolicState
+from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -13,8 +13,8 @@ import numpy as np
 from cnpgen.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.constraints.vertical import Vertical
-from cnpgen.robots.linalg import add, dot, scale, subtract
-from cnpgen.robots.symbolic import SymbolicState, Vec, forward_kinematics
+from cnpgen.symbolic.linalg import add, dot, scale, subtract
+from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics
 
 APART = 0.1  # m: no point on the robot is further than this from its neighbour
 POINT = 1e-12  # m^2: keeps the distance of a point inside a box differentiable

@@ -12,7 +12,7 @@ from cnpgen.kernels.tape import Axes, Grid
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.recipes import Problem
-from cnpgen.robots.symbolic import SymbolicState
+from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -12,9 +12,9 @@ from cnpgen.pipelines.collision import sample_tops
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run
 from cnpgen.recipes import Problem
-from cnpgen.robots.linalg import Scalar, dot, subtract
-from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.store.field import Field
+from cnpgen.symbolic.linalg import Scalar, dot, subtract
+from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

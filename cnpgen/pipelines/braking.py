@@ -18,10 +18,10 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.robots.linalg import Scalar, add, dot, scale
-from cnpgen.robots.symbolic import Vec, bias_acceleration, forward_kinematics, symbols, tip_velocity
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.linalg import Scalar, add, dot, scale
+from cnpgen.symbolic.state import Vec, bias_acceleration, forward_kinematics, symbols, tip_velocity
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

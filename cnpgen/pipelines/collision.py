@@ -16,11 +16,11 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
 from cnpgen.recipes import Problem
-from cnpgen.robots.boxes import segment_box_distance
 from cnpgen.robots.obstacles import obstacle_tops
-from cnpgen.robots.symbolic import SymbolicState, symbols
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.boxes import segment_box_distance
+from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.pipelines.hitting_newton import TOLERANCE, Expansion, expand, safeguard, shortened
 from cnpgen.pipelines.stage import Array
-from cnpgen.robots.linalg import Scalar, add, dot, factorize, gram, scale, solve, substitute, subtract
-from cnpgen.robots.symbolic import Vec, symbols
+from cnpgen.symbolic.linalg import Scalar, add, dot, factorize, gram, scale, solve, substitute, subtract
+from cnpgen.symbolic.state import Vec, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.robots.linalg import Scalar, add, cross, dot, factorize, inverse3, scale, substitute, subtract
-from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
+from cnpgen.symbolic.linalg import Scalar, add, cross, dot, factorize, inverse3, scale, substitute, subtract
+from cnpgen.symbolic.state import Kinematics, Vec, forward_kinematics, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -18,10 +18,10 @@ import numpy as np
 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
-from cnpgen.robots.linalg import Scalar, dot
-from cnpgen.robots.symbolic import Vec, forward_kinematics, symbols
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.linalg import Scalar, dot
+from cnpgen.symbolic.state import Vec, forward_kinematics, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -10,10 +10,10 @@ from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.draw import uniform
 from cnpgen.pipelines.stage import Batch, Run, Stage
-from cnpgen.robots.linalg import Scalar, add, dot, gram, scale, solve, subtract
-from cnpgen.robots.symbolic import Kinematics, Vec, forward_kinematics, symbols
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.linalg import Scalar, add, dot, gram, scale, solve, subtract
+from cnpgen.symbolic.state import Kinematics, Vec, forward_kinematics, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

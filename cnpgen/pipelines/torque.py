@@ -7,9 +7,9 @@ import numpy as np
 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
-from cnpgen.robots.symbolic import inverse_dynamics, symbols
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.state import inverse_dynamics, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

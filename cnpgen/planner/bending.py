@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cnpgen.planner.expressions import equality_residuals
 from cnpgen.recipes import Problem
-from cnpgen.robots.linalg import add, dot, solve
-from cnpgen.robots.symbolic import Vec
+from cnpgen.symbolic.linalg import add, dot, solve
+from cnpgen.symbolic.state import Vec
 from cnpgen.trajectory.spline import basis, clamped_knots
 
 if TYPE_CHECKING:

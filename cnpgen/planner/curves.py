@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.planner.bending import bend
 from cnpgen.recipes import Problem
-from cnpgen.robots.symbolic import Vec, symbols
+from cnpgen.symbolic.state import Vec, symbols
 from cnpgen.trajectory.spline import end_derivatives
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.constraints.constraint import Condition
 from cnpgen.recipes import Problem
-from cnpgen.robots.symbolic import SymbolicState, Vec, forward_kinematics, symbols
+from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.recipes import Problem
-from cnpgen.robots.symbolic import SymbolicState, symbols
+from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.chain import Chain, Joint
-from cnpgen.robots.linalg import Scalar, add, cross, dot, scale, subtract
+from cnpgen.symbolic.linalg import Scalar, add, cross, dot, scale, subtract
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
