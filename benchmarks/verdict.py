@@ -20,7 +20,7 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.verdict import Verdict, judge
 from cnpgen.verdict.course import course
 from cnpgen.verdict.sampling import sample, time_table
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 STEP = 1e-3  # s
 TARGETS = {"airhockey": 3.0, "heavy-object": 8.0}  # ms per plan

@@ -71,7 +71,7 @@ class CertifiedPlan(Stage):
         from cnpgen.refine.polish import refine_task
         from cnpgen.refine.refiner import Refiner
         from cnpgen.refine.task import Task
-        from cnpgen.verify.world import World
+        from cnpgen.world.state import World
 
         problem, robot = context.problem, context.robot
         refiner = Refiner(

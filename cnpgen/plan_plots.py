@@ -13,13 +13,13 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verify.path import PathWorld
+from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 

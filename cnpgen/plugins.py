@@ -6,6 +6,6 @@ from cnpgen.pipelines.stage import Batch, Stage
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.state import SymbolicState
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 __all__ = ["Batch", "Condition", "Constraint", "Context", "Field", "Range", "Stage", "SymbolicState", "World", "field"]

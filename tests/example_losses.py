@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.robots.obstacles import obstacle_tops
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 LABELS = ("hit", "transport")
 PROBLEM_OF = {"hit": "airhockey", "replan": "airhockey", "transport": "heavy-object"}

@@ -17,7 +17,7 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict import Verdict, judge
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 
 @cache

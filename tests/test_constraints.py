@@ -21,7 +21,7 @@ from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
 from cnpgen.symbolic.state import SymbolicState, symbols
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
 

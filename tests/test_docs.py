@@ -15,8 +15,8 @@ import pytest
 
 from cnpgen.library import load_problem
 from cnpgen.robots.robot import load_robot
-from cnpgen.verify.path import PathWorld
-from cnpgen.verify.world import World
+from cnpgen.world.path import PathWorld
+from cnpgen.world.state import World
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])

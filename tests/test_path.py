@@ -12,8 +12,8 @@ from cnpgen.library import load_problem
 from cnpgen.recipes import Problem
 from cnpgen.robots.robot import Robot, load_robot
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verify.path import PathWorld
-from cnpgen.verify.world import World
+from cnpgen.world.path import PathWorld
+from cnpgen.world.state import World
 
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
 ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}

@@ -31,7 +31,7 @@ from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import chebyshev
 from cnpgen.verdict import Verdict
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 LABELS = ("hit", "replan", "transport")
 

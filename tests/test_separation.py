@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cnpgen.verify.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.world.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
 
 SIZE = np.array([0.2, 0.2, 0.3])
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

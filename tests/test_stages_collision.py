@@ -12,7 +12,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.collision import Collision, coal_judge, skeleton_distance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 Array = np.ndarray
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.verify.sweep import RESOLUTION, sweep
+from cnpgen.world.sweep import RESOLUTION, sweep
 
 NOWHERE = np.full(3, np.nan)
 

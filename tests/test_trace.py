@@ -7,8 +7,8 @@ import pytest
 from cnpgen.errors import MachineError
 from cnpgen.library import load_problem
 from cnpgen.robots.robot import load_robot
-from cnpgen.verify import trace as module
-from cnpgen.verify.trace import trace
+from cnpgen.world import trace as module
+from cnpgen.world.trace import trace
 
 
 @pytest.mark.parametrize("name", ["airhockey", "heavy-object"])

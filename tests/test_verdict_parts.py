@@ -6,7 +6,7 @@ from example_plans import PROBLEMS, ROBOTS, load
 
 from cnpgen.constraints.constraint import Condition
 from cnpgen.verdict.parts import name_part
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 
 def names(problem_name: str) -> dict[str, list[str]]:

@@ -22,8 +22,8 @@ from cnpgen.verify import rows as rows_module
 from cnpgen.verify.fastest_hit import highest_speed
 from cnpgen.verify.report import Check, RowReport, merge
 from cnpgen.verify.rows import verify_rows
-from cnpgen.verify.scene import Scene
-from cnpgen.verify.world import World
+from cnpgen.world.scene import Scene
+from cnpgen.world.state import World
 
 Columns = dict[str, np.ndarray]
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")

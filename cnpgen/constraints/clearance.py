@@ -10,7 +10,7 @@ from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.symbolic.state import SymbolicState
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 
 @dataclass(frozen=True, kw_only=True)

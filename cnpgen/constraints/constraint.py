@@ -11,7 +11,7 @@ from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.symbolic.state import SymbolicState
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 End = Literal["start", "goal"]
 
@@ -138,7 +138,7 @@ class Constraint(ABC):
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the same condition with Pinocchio and Coal at the state, or at the K states, that ``world`` holds.
 
-        It is written for one state, and is also given a ``cnpgen.verify.path.PathWorld``, whose arrays have a trailing
+        It is written for one state, and is also given a ``cnpgen.world.path.PathWorld``, whose arrays have a trailing
         axis of K states: ``world.q`` of shape (n, K), ``world.tip_position`` (3, K), distances (K,). So it counts
         indices from the front and uses elementwise operations only: no ``if`` on a value, no ``float()``, ``max()`` or
         ``sum()`` over a vector. Every entry of a condition's ``g`` is then a float or an array of shape (K,); bounds do

@@ -11,7 +11,7 @@ from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
     from cnpgen.symbolic.state import SymbolicState
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 FUNNEL = (0.1, 0.3)  # phases between which a motion that starts off the table must come down to it
 

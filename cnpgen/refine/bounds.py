@@ -12,7 +12,7 @@ from cnpgen.recipes import Problem
 from cnpgen.refine.stage import residual_scale
 
 if TYPE_CHECKING:
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points

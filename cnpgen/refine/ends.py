@@ -12,7 +12,7 @@ from cnpgen.refine.reachable import joint_limits
 from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 # Relative to the bound, or absolute, by the derivative that a condition needs: more than it can change within what the

@@ -89,7 +89,7 @@ def load_refiner(
         options: How to refine.
         passes: Grids and tightening; the usual ones by default.
     """
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
     backend, cache_folder = choose_backend(None)
     kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})

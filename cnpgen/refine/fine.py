@@ -13,7 +13,7 @@ from cnpgen.refine.task import Task
 from cnpgen.refine.transcription import Stage, Transcription, of_last
 
 if TYPE_CHECKING:
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 POINTS = 600

@@ -24,7 +24,7 @@ from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 SLOWEST = 60.0  # s: a plan that takes longer is no start

@@ -12,10 +12,10 @@ from cnpgen.verdict.course import course
 from cnpgen.verdict.margins import measure_condition
 from cnpgen.verdict.sampling import Samples
 from cnpgen.verdict.verdict import Margin
-from cnpgen.verify.path import PathWorld
+from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 

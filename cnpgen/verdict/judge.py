@@ -23,7 +23,7 @@ from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
 from cnpgen.verdict.paper import paper_rule
 from cnpgen.verdict.sampling import Samples, sample, time_table
 from cnpgen.verdict.verdict import Margin, Metrics, PaperRule, Reason, Verdict
-from cnpgen.verify.path import PathWorld
+from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 

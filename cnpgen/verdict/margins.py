@@ -13,10 +13,10 @@ from cnpgen.verdict.course import Course
 from cnpgen.verdict.parts import name_part
 from cnpgen.verdict.sampling import Samples
 from cnpgen.verdict.verdict import NOTHING, Margin, Reason
-from cnpgen.verify.path import PathWorld
+from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
-    from cnpgen.verify.world import World
+    from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from cnpgen.verdict.verdict import PaperRule
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem
-    from cnpgen.verify.path import PathWorld
+    from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from cnpgen.constraints.clearance import RobotClearance
 from cnpgen.verify.report import ENDS, Array, Check, Index, judge
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem

@@ -15,7 +15,7 @@ from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.verify.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
 from cnpgen.verify.fastest_hit import highest_speed
 from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
-from cnpgen.verify.world import World
+from cnpgen.world.state import World
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem

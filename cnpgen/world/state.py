@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.verify.scene import Scene
+from cnpgen.world.scene import Scene
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem

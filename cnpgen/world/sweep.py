@@ -16,7 +16,7 @@ def sweep(bounds: Array, measure: Measure, separate: Separate) -> Array:
     """Find the smallest signed distance of M pairs of convex bodies along K states without measuring every one.
 
     A signed distance of convex bodies is the maximum over unit vectors of their separation along it
-    (``cnpgen.verify.separation``), so that every direction bounds the distances at all states from below. The state of
+    (``cnpgen.world.separation``), so that every direction bounds the distances at all states from below. The state of
     the smallest bound is measured, the direction in which the bodies are apart there raises its neighbours' bounds,
     and so on until no bound is below the smallest distance measured: no state is missed.
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.verify.scene import ENDLESS, Scene
-from cnpgen.verify.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
-from cnpgen.verify.sweep import sweep
-from cnpgen.verify.trace import trace
+from cnpgen.world.scene import ENDLESS, Scene
+from cnpgen.world.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.world.sweep import sweep
+from cnpgen.world.trace import trace
 
 if TYPE_CHECKING:
     from cnpgen.recipes import Problem
@@ -24,7 +24,7 @@ _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 class PathWorld:
     """The robot of a problem along a path, among the obstacles.
 
-    It answers what ``cnpgen.verify.world.World`` answers, with a trailing axis of K states, so that a constraint's
+    It answers what ``cnpgen.world.state.World`` answers, with a trailing axis of K states, so that a constraint's
     ``measured`` form, written for one state, gives arrays of shape (K,). ``set_path`` runs the forward kinematics;
     everything else is computed when it is first read. Vectors are in the world frame. A world belongs to one process
     and one thread: Pinocchio's and Coal's memory is reused from path to path.
@@ -138,7 +138,7 @@ class PathWorld:
         """Measure the signed distance of every segment of the robot's skeleton from every obstacle, one by one [m].
 
         Returns:
-            Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
+            Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
         """
         segments, boxes = self.segments(), self._boxes
         ends = [(segment, box) for segment in segments for box in boxes]
@@ -158,7 +158,7 @@ class PathWorld:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
 
         Returns:
-            Arrays of shape (K,), of each of which the smallest value is exact; see ``cnpgen.verify.sweep.sweep``.
+            Arrays of shape (K,), of each of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
 
         Raises:
             RecipeError: The problem has no object.

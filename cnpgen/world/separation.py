@@ -2,7 +2,7 @@
 
 The signed distance of two convex bodies (minus their depth, where they overlap) is the maximum over unit vectors u of
 their separation ``min over a of u . a - max over b of u . b``: any u gives a lower bound. Box faces and the body's own
-faces are tried on all states at once; better vectors come from measurements (``cnpgen.verify.sweep``).
+faces are tried on all states at once; better vectors come from measurements (``cnpgen.world.sweep``).
 """
 
 from dataclasses import dataclass
