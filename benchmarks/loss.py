@@ -17,10 +17,10 @@ from unittest import mock
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
 
-from cnpgen.library import load_problem
 from cnpgen.losses import quadrature as rules
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 
 Array = np.ndarray[Any, np.dtype[Any]]
 PROBLEMS = ("airhockey", "heavy-object")

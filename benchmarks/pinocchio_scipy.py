@@ -8,8 +8,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, linprog, minimize
 
-from cnpgen.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]

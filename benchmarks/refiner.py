@@ -27,7 +27,7 @@ from slsqp import minimise_slsqp
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.problem import open_problem
+from cnpgen.problems.record import open_problem
 from cnpgen.refine.engine import load_refiner, prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions

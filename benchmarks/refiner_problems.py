@@ -13,7 +13,7 @@ from cnpgen.pipelines.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stage import Batch
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.problem import open_problem, record_problem
+from cnpgen.problems.record import open_problem, record_problem
 from cnpgen.refine.engine import prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions

@@ -16,7 +16,7 @@ import numpy as np
 from common import arguments, median, report, table, verdict
 
 from cnpgen.plans import Plans, load_plans, open_problem
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.verdict import Verdict, judge
 from cnpgen.verdict.course import course
 from cnpgen.verdict.sampling import sample, time_table

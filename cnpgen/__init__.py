@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation, evaluate_plans
     from cnpgen.export.plans import export_plans
     from cnpgen.interop.omega import Omega
-    from cnpgen.library import load_dataset_recipe, load_pipeline, load_problem
+    from cnpgen.library import load_dataset_recipe, load_pipeline
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
     from cnpgen.losses.metric import Metric
@@ -27,10 +27,11 @@ if TYPE_CHECKING:
     from cnpgen.plans.load import load_plans
     from cnpgen.plans.plans import Plans, make_plans
     from cnpgen.plans.save import save_plans
+    from cnpgen.problems.load import load_problem
+    from cnpgen.problems.obstacles import obstacle_tops
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.proof import explain_plans
     from cnpgen.refinement import Refinement, refine_plans
-    from cnpgen.robots.obstacles import obstacle_tops
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.inspection import inspect_dataset
@@ -73,11 +74,11 @@ _HOME = {
     "load_model": "planner.model_file",
     "load_pipeline": "library",
     "load_plans": "plans.load",
-    "load_problem": "library",
+    "load_problem": "problems.load",
     "load_problems": "solving",
     "make_dataset": "make",
     "make_plans": "plans.plans",
-    "obstacle_tops": "robots.obstacles",
+    "obstacle_tops": "problems.obstacles",
     "open_dataset": "store.reader",
     "refine_plans": "refinement",
     "rotating_shift": "losses.quadrature",

@@ -11,8 +11,8 @@ from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Run, Stage
-from cnpgen.recipes import DatasetRecipe, Problem
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import DatasetRecipe, Problem
 from cnpgen.store.field import Field
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

@@ -14,7 +14,7 @@ from cnpgen.certification import PlanCheck, check_plans
 from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError, counted
 from cnpgen.machine.workers import share_out
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.robot import load_robot
 from cnpgen.shard_checks import check_numbers
 from cnpgen.store.blueprint import DatasetPlan, ShardTask
 from cnpgen.store.check import DELETE, Finding

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.pipelines.stage import Stage
-from cnpgen.recipes import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved
-from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.problem import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, Range, keys
 

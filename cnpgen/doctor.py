@@ -269,7 +269,7 @@ def _check_recipes(found: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
         from cnpgen.library import load_dataset_recipe
-        from cnpgen.robots.robot import load_robot
+        from cnpgen.problems.robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root
 
         names = list(list_recipes("dataset"))

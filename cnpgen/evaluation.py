@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import counted
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
-from cnpgen.plans.problem import open_problem
 from cnpgen.plans.status import PlanStatus
+from cnpgen.problems.record import open_problem
 from cnpgen.verdict import Reason, Verdict, judge, summarise
 from cnpgen.verdict.judge import check_step
 

@@ -1,34 +1,20 @@
 """Find, list and load recipes: those that cnpgen ships by name, anybody's by path."""
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stage import Stage
-from cnpgen.recipe_checks import problem_mistakes, tables
-from cnpgen.recipes import DatasetRecipe, Pipeline, Problem
+from cnpgen.problems.checks import tables
+from cnpgen.problems.load import missing_kinds, read_problem, restoring_reader, without_defaults
+from cnpgen.problems.problem import DatasetRecipe, Pipeline, Problem
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import digest_of, find_file, load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind, is_kind, read_table
-
-
-def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
-    """Load a problem.
-
-    Args:
-        name_or_path: Name of a shipped problem, or path of a problem file.
-        relative_to: Folder that a path is relative to; by default the working directory.
-
-    Raises:
-        RecipeError: With every mistake in the file.
-    """
-    return load_recipe(("problem",), name_or_path, relative_to, _problem)
 
 
 def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) -> Pipeline:
@@ -73,22 +59,8 @@ def dataset_recipe_of(recipe: object) -> DatasetRecipe:
     expected = "the name of a dataset or pipeline, the path of a recipe file or a DatasetRecipe"
     if isinstance(recipe, Pipeline):
         rows = f'DatasetRecipe(name={recipe.name!r}, pipeline=..., splits={{"train": 1000}})'
-        raise UsageError(f"recipe must be {expected}, got a Pipeline: make {rows} of it (cnpgen.recipes)")
+        raise UsageError(f"recipe must be {expected}, got a Pipeline: make {rows} of it (cnpgen.problems.problem)")
     raise UsageError(f"recipe must be {expected}, got {recipe!r}")
-
-
-def problem_of(problem: object) -> Problem:
-    """Return the problem that is meant: itself, or what its name or file says.
-
-    Raises:
-        UsageError: It is nothing of the kind.
-        RecipeError: With every mistake in the file.
-    """
-    if isinstance(problem, Problem):
-        return problem
-    if isinstance(problem, str | Path):
-        return load_problem(problem)
-    raise UsageError(f"problem must be the name of a problem, the path of a problem file or a Problem, got {problem!r}")
 
 
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
@@ -103,19 +75,13 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
         RecipeError: The content does not fit this version of cnpgen.
         PluginError: A package that it needs is not installed.
     """
-    path, mistakes = folder / "recipe.toml", list[str]()
-    if missing := _missing_plugins(content):
+    pipeline_table = content["pipeline"]
+    missing = missing_kinds(registry.STAGES, tables(pipeline_table, "stage"))
+    missing += missing_kinds(registry.CONSTRAINTS, tables(pipeline_table["problem"], "constraint"))
+    if missing:
         raise PluginError(missing)
-    content = _without_defaults(content)
-    problem_table = content["pipeline"]["problem"]
-    problem_table["robot"]["urdf"] = "robot.urdf"
-    (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
-
-    def problem(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
-        readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
-        made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
-        digest = digest_of(json.dumps(value, sort_keys=True).encode(), urdf.encode())
-        return made and replace(made, path=path, digest=digest)
+    path, mistakes = folder / "recipe.toml", list[str]()
+    content, problem = without_defaults(content), restoring_reader(urdf, path)
 
     def pipeline(value: Any, where: Place, mistakes: list[str]) -> Pipeline | None:
         readers: dict[type, Reader] = {Stage: partial(read_kind, registry.STAGES), Problem: problem}
@@ -126,26 +92,6 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     if made is None or mistakes:
         raise RecipeError(mistakes)
     return replace(made, path=path)
-
-
-def _missing_plugins(content: dict[str, Any]) -> list[str]:
-    """Say which packages a resolved recipe needs that are not installed."""
-    pipeline = content["pipeline"]
-    kinds = [(registry.STAGES, table) for _, table in tables(pipeline, "stage")]
-    kinds += [(registry.CONSTRAINTS, table) for _, table in tables(pipeline["problem"], "constraint")]
-    found = (registry.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for group, each in kinds)
-    return list(dict.fromkeys(text for text in found if text))
-
-
-def _without_defaults(value: Any) -> Any:
-    """Leave out nulls, empty arrays and what is noted of plug-ins: in a recipe they are not said."""
-    if isinstance(value, dict):
-        said = {key: entry for key, entry in value.items() if entry is not None and entry != []}
-        if "use" in said:
-            said.pop("source", None)
-            said.pop("package", None)
-        return {key: _without_defaults(entry) for key, entry in said.items()}
-    return [_without_defaults(entry) for entry in value] if isinstance(value, list) else value
 
 
 def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | None = None) -> Path:
@@ -165,22 +111,6 @@ def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | Non
         raise RecipeError([str(error)]) from error
 
 
-def _problem(path: Path, mistakes: list[str]) -> Problem | None:
-    read = read_table(path, ("problem",), mistakes)
-    if read is None:
-        return None
-    data, table = read
-    where = Place(str(path))
-    readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
-    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
-    before = len(mistakes)
-    mistakes.extend(problem_mistakes(table, where, path.parent))
-    if problem is None or len(mistakes) > before:
-        return None
-    problem = replace(problem, path=path.absolute())
-    return replace(problem, digest=digest_of(data, problem.urdf_path.read_bytes()))
-
-
 def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
     read = read_table(path, ("pipeline",), mistakes)
     if read is None:
@@ -188,7 +118,7 @@ def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
     data, table = read
     readers: dict[type, Reader] = {
         Stage: partial(read_kind, registry.STAGES),
-        Problem: reference("problem", _problem, path.parent),
+        Problem: reference("problem", read_problem, path.parent),
     }
     made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
     return made and replace(made, path=path.absolute(), digest=digest_of(data, made.problem.digest.encode()))

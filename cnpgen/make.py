@@ -17,7 +17,7 @@ from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.make_plan import dataset_folder, plan_dataset
 from cnpgen.make_shard import Job, make_shards
 from cnpgen.pipelines.stage import BLOCK_ROWS
-from cnpgen.recipes import DatasetRecipe
+from cnpgen.problems.problem import DatasetRecipe
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.check import check_documents

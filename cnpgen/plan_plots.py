@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.table import Table
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.recipes import Problem
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.trajectory.motion import Motion

@@ -1,8 +1,8 @@
 """What packages with stages and constraints of their own import: these names stay here, wherever their modules are."""
 
-from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Batch, Stage
+from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.state import SymbolicState

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import EXACTNESS
+from cnpgen.problems.constraints.constraint import EXACTNESS
 from cnpgen.store.blueprint import DatasetPlan, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.record import ShardRecord

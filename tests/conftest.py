@@ -23,7 +23,7 @@ from cnpgen.library import load_dataset_recipe, load_pipeline
 from cnpgen.make import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
-from cnpgen.recipes import DatasetRecipe, Pipeline
+from cnpgen.problems.problem import DatasetRecipe, Pipeline
 from cnpgen.robots.robot import Robot
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")

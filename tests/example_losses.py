@@ -10,7 +10,7 @@ from example_plans import KNOTS, PROBLEMS, ROBOTS, load
 from scipy.interpolate import BSpline
 
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.world.state import World
 
 LABELS = ("hit", "transport")

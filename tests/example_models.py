@@ -12,8 +12,8 @@ from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.kit import Surroundings, make_kit
 from cnpgen.planner.landing import make_landing
 from cnpgen.planner.model import Meaning, Model
-from cnpgen.plans.problem import record_problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.record import record_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.step import Learner

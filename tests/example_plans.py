@@ -10,9 +10,10 @@ import pinocchio as pin
 from scipy.integrate import simpson
 from scipy.interpolate import BSpline
 
-from cnpgen.library import load_problem
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict import Verdict, judge

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from cnpgen.interop.omega import Omega
-from cnpgen.library import load_problem
+from cnpgen.problems.load import load_problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import clamped_knots
 

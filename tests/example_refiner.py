@@ -7,13 +7,13 @@ from example_plans import PROBLEMS, ROBOTS, Plan
 
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
-from cnpgen.recipes import Problem
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.criterion import Criterion
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Refined, Task
-from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict import Verdict, judge

@@ -186,8 +186,8 @@ def test_the_verifier_runs_without_a_module_of_what_it_verifies() -> None:
     code = """
 import sys
 import numpy as np
-from cnpgen.library import load_problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.verify.rows import verify_rows
 problem = load_problem("heavy-object")
 robot = load_robot(problem)

@@ -13,7 +13,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.library import dataset_recipe_of, load_pipeline
 from cnpgen.make import make_dataset
 from cnpgen.make_plan import plan_dataset
-from cnpgen.recipes import DatasetRecipe
+from cnpgen.problems.problem import DatasetRecipe
 from cnpgen.schema.arguments import flag, integer, number
 from cnpgen.validation import validate_dataset
 

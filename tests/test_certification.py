@@ -17,11 +17,11 @@ from cnpgen.evaluation import evaluate_plans
 from cnpgen.library import load_dataset_recipe
 from cnpgen.make import make_dataset
 from cnpgen.plans import load_plans, save_plans
-from cnpgen.plans.problem import record_problem
+from cnpgen.problems.record import record_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.refine import polish
 from cnpgen.refine.task import Refined
 from cnpgen.refinement import refine_plans
-from cnpgen.robots.robot import load_robot
 from cnpgen.solving import load_problems, problems_of_rows
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset

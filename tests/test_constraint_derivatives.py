@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from test_constraints import HEAVY, KINDS, Bench, gantry_problem, measured_forms, values
 
-from cnpgen.library import load_problem
+from cnpgen.problems.load import load_problem
 from cnpgen.refine.stage import stage_jacobian, stage_values
 
 STEP = 1e-6

@@ -9,14 +9,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.constraints.constraint import EXACTNESS, Condition, Constraint
-from cnpgen.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
-from cnpgen.constraints.table import Table
-from cnpgen.constraints.vertical import Vertical
-from cnpgen.library import load_problem
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.library import load_problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 from example_stages import Roll
 
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
-from cnpgen.library import find_recipe, load_dataset_recipe, load_pipeline, load_problem
-from cnpgen.recipes import recipe_digest, resolved
+from cnpgen.library import find_recipe, load_dataset_recipe, load_pipeline
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import recipe_digest, resolved
 from cnpgen.schema import catalogue, registry
 from cnpgen.schema.catalogue import list_recipes, recipes_root
 from cnpgen.schema.keys import Range, field

@@ -11,12 +11,12 @@ from conftest import needs_compiler
 from example_losses import PROBLEM_OF, Batch, batch, huber, loss, states, step_losses
 from example_plans import PROBLEMS
 
-from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import CnpgenError
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import quadrature
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.motion import Motion
 

@@ -12,12 +12,12 @@ from example_losses import huber
 from example_plans import PROBLEMS, ROBOTS
 from test_symbolic import HIGH, LOW, box_bounds, coal_segment_separation, segments
 
-from cnpgen.constraints.constraint import Condition
 from cnpgen.kernels.interpreted import InterpretedGridKernel
 from cnpgen.kernels.tape import Grid, tape_from_function
 from cnpgen.losses.published import published
 from cnpgen.losses.stage import HeldState
 from cnpgen.losses.terms import constraint_term
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.symbolic.boxes import signed_segment_box_distance
 from cnpgen.symbolic.state import SymbolicState, symbols
 

@@ -45,7 +45,7 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
 INSTALLED = """
 import cnpgen, sys
 from importlib.metadata import entry_points, version
-from cnpgen.library import recipes_root
+from cnpgen.schema.catalogue import recipes_root
 assert cnpgen.__file__.startswith(sys.argv[1]), cnpgen.__file__
 assert recipes_root().is_relative_to(sys.argv[1]), recipes_root()
 for name in cnpgen.__all__:

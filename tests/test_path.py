@@ -8,9 +8,10 @@ import pytest
 from scipy.interpolate import BSpline
 
 from cnpgen.errors import RecipeError
-from cnpgen.library import load_problem
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World

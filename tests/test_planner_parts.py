@@ -14,7 +14,7 @@ from cnpgen.evaluation import evaluate_plans
 from cnpgen.planner.kit import make_kit
 from cnpgen.planner.slowing import PHASES, SLOWEST, make_slowing
 from cnpgen.plans.plans import make_plans
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import anchor_line, assemble
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import chebyshev

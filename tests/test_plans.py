@@ -21,7 +21,6 @@ import pytest
 from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
 from cnpgen.evaluation import evaluate_plans
 from cnpgen.export import export_plans
-from cnpgen.library import load_problem
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.plans import (
     Plans,
@@ -34,9 +33,10 @@ from cnpgen.plans import (
     save_plans,
     screen,
 )
-from cnpgen.recipes import resolved
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import resolved
+from cnpgen.problems.robot import load_robot
 from cnpgen.refinement import refine_plans
-from cnpgen.robots.robot import load_robot
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 
 DOCS = Path(__file__).parents[1] / "docs" / "plan-format.md"

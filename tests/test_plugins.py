@@ -6,9 +6,9 @@ from importlib.metadata import EntryPoint, EntryPoints
 import pytest
 from example_stages import Idle
 
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stage import Stage
+from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
 from cnpgen.schema.registry import CONSTRAINTS, STAGES, load, name_of, names

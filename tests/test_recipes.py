@@ -10,8 +10,9 @@ import pytest
 from example_stages import Roll
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.library import load_dataset_recipe, load_problem
-from cnpgen.recipes import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved, split_rows
+from cnpgen.library import load_dataset_recipe
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved, split_rows
 from cnpgen.robots.spec import LimitSpec, Obstacle, RobotSpec
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range

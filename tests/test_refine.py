@@ -9,9 +9,9 @@ import pytest
 from example_plans import PROBLEMS, Plan, load, raised
 from example_refiner import library, refine, refiner, refiner_of, task, tops, verdict
 
-from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.refine import sqp
 from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals

@@ -19,7 +19,7 @@ from cnpgen.evaluation import evaluate_plans
 from cnpgen.make import make_dataset
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.problem import open_problem
+from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.task import Outcome
 from cnpgen.refinement import refine_plans

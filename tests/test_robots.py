@@ -9,9 +9,9 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.library import load_problem
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
 
 HEAVY = load_problem("heavy-object")
 AIRHOCKEY = load_problem("airhockey")

@@ -10,7 +10,7 @@ from cnpgen.library import load_dataset_recipe
 from cnpgen.planner.model_file import load_model, shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
-from cnpgen.plans.problem import record_problem
+from cnpgen.problems.record import record_problem
 
 LARGEST = 3_000_000  # bytes
 STRICT = {"airhockey-hit": 0.95, "airhockey-replan": 0.85, "heavy-object": 0.95}

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from conftest import Prepare, needs_compiler, run_stages
 
-from cnpgen.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.collision import Collision, coal_judge, skeleton_distance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.world.state import World
 
 Array = np.ndarray

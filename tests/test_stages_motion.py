@@ -10,7 +10,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.motion import TableAcceleration, TableVelocity, table_acceleration, table_velocity
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stage import Batch
-from cnpgen.recipes import Pipeline
+from cnpgen.problems.problem import Pipeline
 
 EXACT = 1e-9  # m/s and m/s^2
 DRAWS = 2000

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from conftest import Arm, Prepare, run_stages, without_stages
 
-from cnpgen.constraints.table import Table
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.prepared import random_generator
 from cnpgen.pipelines.reach import BallisticReach
 from cnpgen.pipelines.stage import Batch
+from cnpgen.problems.constraints.table import Table
 
 
 def batch_at(

@@ -11,9 +11,10 @@ import pytest
 
 from cnpgen.kernels.interpreted import InterpretedKernel
 from cnpgen.kernels.tape import tape_from_function
-from cnpgen.library import load_problem
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.symbolic.boxes import segment_box_distance, segment_box_separation, upright_box_separation
 from cnpgen.symbolic.state import bias_acceleration, forward_kinematics, inverse_dynamics, symbols, tip_velocity

@@ -5,8 +5,8 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import MachineError
-from cnpgen.library import load_problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.world import trace as module
 from cnpgen.world.trace import trace
 

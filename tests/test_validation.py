@@ -12,9 +12,9 @@ import pytest
 from conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, tiny_recipe
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.library import load_problem
 from cnpgen.make import make_dataset
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import ShardTask, load_plan, shards
 from cnpgen.store.check import MAKE_AGAIN
 from cnpgen.store.files.atomic import file_sha256

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from example_plans import PROBLEMS, ROBOTS, Course, Plan, bent, course, joined, load
 
-from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.constraints.table import Table
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.table import Table
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict import Reason, judge

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from example_plans import PROBLEMS, ROBOTS, load
 
-from cnpgen.constraints.constraint import Condition
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.verdict.parts import name_part
 from cnpgen.world.state import World
 

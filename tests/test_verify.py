@@ -12,12 +12,13 @@ import pinocchio as pin
 import pytest
 from scipy.optimize import linprog, minimize_scalar
 
-from cnpgen.constraints.clearance import RobotClearance
-from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import DatasetError, RecipeError
-from cnpgen.library import load_problem
-from cnpgen.robots.obstacles import obstacle_tops
-from cnpgen.robots.robot import Robot, load_robot
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.verify import rows as rows_module
 from cnpgen.verify.fastest_hit import highest_speed
 from cnpgen.verify.report import Check, RowReport, merge
@@ -642,8 +643,8 @@ def test_judge_shares_no_code_with_what_it_judges():
     program = """
 import sys
 import numpy as np
-from cnpgen.library import load_problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.verify.rows import verify_rows
 problem = load_problem("heavy-object")
 robot = load_robot(problem)

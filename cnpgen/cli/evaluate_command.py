@@ -96,7 +96,7 @@ def _write_json(file: Path, found: "Evaluation") -> None:
 def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     from cnpgen.plan_plots import plot_plan
     from cnpgen.plans import open_problem
-    from cnpgen.robots.obstacles import obstacle_tops
+    from cnpgen.problems.obstacles import obstacle_tops
 
     plans, chosen = found.plans, _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)

@@ -85,7 +85,7 @@ def _pipelines() -> list[dict[str, Any]]:
 
 
 def _problems() -> list[dict[str, Any]]:
-    from cnpgen.library import load_problem
+    from cnpgen.problems.load import load_problem
     from cnpgen.schema.catalogue import list_recipes
 
     entries = []

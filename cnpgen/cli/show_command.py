@@ -67,12 +67,13 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
     Raises:
         RecipeError: There is none, or it has mistakes.
     """
-    from cnpgen import library
+    from cnpgen.library import load_dataset_recipe, load_pipeline
+    from cnpgen.problems.load import load_problem
 
     kind = kind or _kind(name_or_path)
     if kind == "dataset":
-        return library.load_dataset_recipe(name_or_path)
-    return library.load_pipeline(name_or_path) if kind == "pipeline" else library.load_problem(name_or_path)
+        return load_dataset_recipe(name_or_path)
+    return load_pipeline(name_or_path) if kind == "pipeline" else load_problem(name_or_path)
 
 
 def _kind(name_or_path: str) -> "Kind":

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
-from cnpgen.library import problem_of
+from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
 from cnpgen.losses.plan_batch import real_array
 from cnpgen.network import omega
 from cnpgen.network.omega import ControlPoints
@@ -23,9 +22,10 @@ from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.recipes import Problem
-from cnpgen.robots.obstacles import obstacle_tops
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import problem_of
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem, problem_identity
+from cnpgen.problems.robot import load_robot
 from cnpgen.schema.arguments import integer, number
 from cnpgen.trajectory.boundary import Boundary
 

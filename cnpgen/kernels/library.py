@@ -23,7 +23,6 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
 from cnpgen.kernels.tape import CODES, Dtype, Grid, Loop, Tape, tape_from_function
 from cnpgen.kernels.together import Compilers
-from cnpgen.recipes import Problem, resolved
 from cnpgen.schema.registry import package_digest
 
 Backend = Literal["compiled", "numpy", "casadi"]
@@ -152,7 +151,7 @@ def _store(path: Path, data: bytes) -> None:
 def _shared_digest() -> str:
     """Digest of what builders of several folders use: kernels are rebuilt when it changes."""
     root = Path(__file__).parents[1]
-    return _digest_of(*(root / folder for folder in ("robots", "symbolic", "kernels", "constraints", "trajectory")))
+    return _digest_of(*(root / folder for folder in ("robots", "symbolic", "kernels", "problems", "trajectory")))
 
 
 def _source_digest(builder: Callable[..., Any]) -> str:
@@ -170,13 +169,6 @@ def _digest_of(*folders: Path) -> str:
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
-
-
-def problem_identity(problem: Problem) -> str:
-    """Digest of what kernels are built from: the problem as it is, wherever it came from, and its URDF."""
-    content = resolved(problem)
-    del content["title"], content["robot"]["urdf"]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode() + problem.urdf_path.read_bytes()).hexdigest()
 
 
 def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:

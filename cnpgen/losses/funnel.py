@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.errors import UsageError
 from cnpgen.losses.stage import has_funnel, stated
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:

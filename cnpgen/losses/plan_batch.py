@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 
 Array = NDArray[Any]
 BLOCK = 128  # plans at a time: their points stay in the cache

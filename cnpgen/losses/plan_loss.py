@@ -10,17 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.kernels.grid import GridKernel
-from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend, problem_identity
+from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
 from cnpgen.kernels.tape import DTYPES, Dtype
-from cnpgen.library import problem_of
 from cnpgen.losses.funnel import Funnel, make_funnel
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes, real_array
 from cnpgen.losses.quadrature import Table, basis_table, check_quadrature
 from cnpgen.losses.stage import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
 from cnpgen.losses.value import LossValue
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.load import problem_of
+from cnpgen.problems.problem import Problem, problem_identity
+from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import flag, number
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.constraints.vertical import Vertical
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.symbolic.linalg import add, dot, scale, subtract
 from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics
 

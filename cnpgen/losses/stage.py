@@ -7,11 +7,11 @@ functions) and the quadrature weight of the node.
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.constraints.constraint import Condition, Constraint
 from cnpgen.kernels.tape import Axes, Grid
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.constraints.constraint import Condition
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.symbolic.linalg import cross, dot
 from cnpgen.symbolic.state import SymbolicState, body_motions, carried
 

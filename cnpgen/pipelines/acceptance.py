@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.constraints.constraint import EXACTNESS, End
 from cnpgen.pipelines.collision import sample_tops
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import EXACTNESS, End
+from cnpgen.problems.problem import Problem
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, dot, subtract
 from cnpgen.symbolic.state import SymbolicState, symbols

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stage import Array, Batch, Run, Stage
-from cnpgen.recipes import Problem
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.boxes import segment_box_distance

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import TypeVar
 
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.store.field import Field

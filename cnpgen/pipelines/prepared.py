@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.constraints.constraint import EXACTNESS
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.kernels.library import Backend, KernelLibrary, problem_identity
+from cnpgen.kernels.library import Backend, KernelLibrary
 from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.piece import Block, Piece
 from cnpgen.pipelines.stage import Array, Batch, Run
-from cnpgen.recipes import Pipeline
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.constraints.constraint import EXACTNESS
+from cnpgen.problems.problem import Pipeline, problem_identity
+from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.store.field import Field
 

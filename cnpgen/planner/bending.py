@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.planner.expressions import equality_residuals
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.linalg import add, dot, solve
 from cnpgen.symbolic.state import Vec
 from cnpgen.trajectory.spline import basis, clamped_knots

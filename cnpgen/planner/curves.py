@@ -10,7 +10,7 @@ start_q, start_dq, start_ddq, goal_q, goal_dq.
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.planner.bending import bend
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import Vec, symbols
 from cnpgen.trajectory.spline import end_derivatives
 

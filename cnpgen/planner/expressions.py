@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import Condition
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics, symbols
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.slowing import Slowing, make_slowing
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.problem import ProblemRecord
 from cnpgen.plans.status import PlanStatus
-from cnpgen.recipes import Problem
-from cnpgen.robots.robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord
+from cnpgen.problems.robot import load_robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 

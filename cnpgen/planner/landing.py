@@ -13,7 +13,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.curves import FIXED_AT_GOAL, path_bend, path_bend_adjoint
 from cnpgen.planner.lanes import lanes
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 
 Array = NDArray[Any]
 

@@ -12,7 +12,7 @@ from cnpgen.network.architecture import Architecture, Weights
 from cnpgen.network.features import Features
 from cnpgen.network.forward import forward
 from cnpgen.network.tasks import Tasks
-from cnpgen.plans.problem import ProblemRecord
+from cnpgen.problems.record import ProblemRecord
 
 Array = NDArray[Any]
 

@@ -13,7 +13,7 @@ from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.network.architecture import Architecture
 from cnpgen.network.features import BLOCKS, Features
 from cnpgen.planner.model import Meaning, Model
-from cnpgen.plans.problem import ProblemRecord
+from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
 from cnpgen.store.paths import require_file

@@ -12,8 +12,8 @@ from cnpgen.network.tasks import Tasks, expected_time
 from cnpgen.planner.curves import line_bend
 from cnpgen.planner.expressions import tip_position
 from cnpgen.planner.lanes import ends_of, lanes, rows
-from cnpgen.recipes import Problem
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:

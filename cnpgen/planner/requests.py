@@ -13,7 +13,7 @@ from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
 from cnpgen.plans.layout import BOUNDARY
-from cnpgen.plans.problem import ProblemRecord
+from cnpgen.problems.record import ProblemRecord
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import speed_bounds, speed_excess, speed_residuals
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import basis, chebyshev
 

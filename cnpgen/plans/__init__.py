@@ -2,9 +2,9 @@
 
 from cnpgen.plans.load import load_plans
 from cnpgen.plans.plans import Plans, concatenate, make_plans, screen
-from cnpgen.plans.problem import ProblemRecord, open_problem, record_problem
 from cnpgen.plans.save import save_plans
 from cnpgen.plans.status import PlanStatus
+from cnpgen.problems.record import ProblemRecord, open_problem, record_problem
 
 __all__ = [
     "PlanStatus",

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, counted, nearest
-from cnpgen.library import load_problem
 from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
-from cnpgen.recipes import Problem
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, record_problem
 from cnpgen.store.files.hdf5 import opened_foreign_hdf5
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.layout import FLOATS, INTEGERS, NOTES
-from cnpgen.plans.problem import ProblemRecord, record_problem
 from cnpgen.plans.status import PlanStatus
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, record_problem
 from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.stage import residual_scale
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:

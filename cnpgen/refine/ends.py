@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.constraints.joint import JointTorque
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.reachable import joint_limits
-from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.state import World

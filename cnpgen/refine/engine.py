@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.problem import ProblemRecord, open_problem
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.record import ProblemRecord, open_problem
 from cnpgen.refine.criterion import choose_criterion
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import DEFAULT, RefineOptions
@@ -17,11 +18,10 @@ from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Passes, Refiner
 from cnpgen.refine.sqp import Settings
 from cnpgen.refine.task import Refined, Task
-from cnpgen.robots.obstacles import obstacle_tops
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]

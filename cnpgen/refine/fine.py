@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.bounds import BoundsTemplate, Tightening
 from cnpgen.refine.grid import make_grid
 from cnpgen.refine.task import Task

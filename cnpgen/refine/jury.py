@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.task import Task
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

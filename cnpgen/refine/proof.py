@@ -21,7 +21,7 @@ from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
     from cnpgen.plans.plans import Plans
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -89,8 +89,8 @@ def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[in
     Raises:
         UsageError: There is no plan of such an index.
     """
-    from cnpgen.plans.problem import open_problem
     from cnpgen.plans.status import PlanStatus
+    from cnpgen.problems.record import open_problem
 
     if which is None:
         which = np.flatnonzero(plans.status != PlanStatus.VALID).tolist()

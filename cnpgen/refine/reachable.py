@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.joint import JointAcceleration, JointPosition, JointVelocity
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointVelocity
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.refine import starts
 from cnpgen.refine.alternatives import minimise_with
 from cnpgen.refine.bounds import Bounds, BoundsTemplate, Tightening

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.recipes import Problem
+from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.table import Table
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.reachable import Departure, JointLimits, departures, joint_limits, moments
 from cnpgen.refine.tip_bound import Arm, bound_projection
 from cnpgen.robots.robot import Robot

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.pipelines.stage import Stage
+from cnpgen.problems.constraints.constraint import Constraint
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
@@ -40,14 +40,14 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "certified-plan": "cnpgen.certification:CertifiedPlan",
     },
     CONSTRAINTS: {
-        "joint-position": "cnpgen.constraints.joint:JointPosition",
-        "joint-velocity": "cnpgen.constraints.joint:JointVelocity",
-        "joint-acceleration": "cnpgen.constraints.joint:JointAcceleration",
-        "joint-torque": "cnpgen.constraints.joint:JointTorque",
-        "table": "cnpgen.constraints.table:Table",
-        "vertical": "cnpgen.constraints.vertical:Vertical",
-        "robot-clearance": "cnpgen.constraints.clearance:RobotClearance",
-        "object-contact": "cnpgen.constraints.clearance:ObjectContact",
+        "joint-position": "cnpgen.problems.constraints.joint:JointPosition",
+        "joint-velocity": "cnpgen.problems.constraints.joint:JointVelocity",
+        "joint-acceleration": "cnpgen.problems.constraints.joint:JointAcceleration",
+        "joint-torque": "cnpgen.problems.constraints.joint:JointTorque",
+        "table": "cnpgen.problems.constraints.table:Table",
+        "vertical": "cnpgen.problems.constraints.vertical:Vertical",
+        "robot-clearance": "cnpgen.problems.constraints.clearance:RobotClearance",
+        "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
     },
 }
 

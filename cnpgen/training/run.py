@@ -14,7 +14,7 @@ from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_wait
 from cnpgen.network.features import Features
 from cnpgen.planner.model import Meaning, Model
-from cnpgen.plans.problem import ProblemRecord
+from cnpgen.problems.record import ProblemRecord
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.journal import Journal
 from cnpgen.training.rows import Rows

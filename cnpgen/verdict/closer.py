@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.clearance import ObjectContact
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
 from cnpgen.verdict.course import course
 from cnpgen.verdict.margins import measure_condition

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.table import Table
-from cnpgen.constraints.vertical import Vertical
 from cnpgen.errors import UsageError
-from cnpgen.recipes import Problem
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.recipes import Problem
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.verdict.course import Course
 from cnpgen.verdict.parts import name_part

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.clearance import ObjectContact
-from cnpgen.constraints.constraint import Constraint
-from cnpgen.constraints.joint import JointAcceleration, JointTorque, JointVelocity
-from cnpgen.constraints.table import Table
-from cnpgen.constraints.vertical import Vertical
+from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.verdict.verdict import PaperRule
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
     from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]

@@ -2,14 +2,14 @@
 
 from typing import TYPE_CHECKING
 
-from cnpgen.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.constraints.constraint import Condition, Constraint
-from cnpgen.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
-from cnpgen.constraints.table import Table
-from cnpgen.constraints.vertical import Vertical
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
 
 _PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointTorque
 

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cnpgen.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.verify.report import ENDS, Array, Check, Index, judge
 from cnpgen.world.state import World
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
 
 # What stored diagnostics may differ by, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounded
 # joint positions move the arm by 1e-7 m and its highest speed by 2e-6 m/s in 40,000 rows: bounds must hold for all.

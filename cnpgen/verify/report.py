@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import End
+from cnpgen.problems.constraints.constraint import End
 
 ENDS: tuple[End, End] = ("start", "goal")
 

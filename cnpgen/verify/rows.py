@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cnpgen.constraints.constraint import EXACTNESS, Condition
 from cnpgen.errors import DatasetError
-from cnpgen.robots.obstacles import obstacle_tops
+from cnpgen.problems.constraints.constraint import EXACTNESS, Condition
+from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.verify.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
 from cnpgen.verify.fastest_hit import highest_speed
 from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
 from cnpgen.world.state import World
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
 BLOCK = 1024  # rows: what is collected of a block before it is judged stays below 10 MB
@@ -47,7 +47,7 @@ def verify_rows(
     * "holding torque ratio" and "clearance": what the rows store of an end as ``start_torque_ratio``,
       ``goal_torque_ratio``, ``start_clearance`` and ``goal_clearance`` is what is computed there.
 
-    How exactly each must hold is ``cnpgen.constraints.constraint.EXACTNESS``.
+    How exactly each must hold is ``cnpgen.problems.constraints.constraint.EXACTNESS``.
 
     Args:
         problem: The problem.

@@ -13,7 +13,7 @@ from cnpgen.world.sweep import sweep
 from cnpgen.world.trace import trace
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]

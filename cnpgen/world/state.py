@@ -9,7 +9,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.world.scene import Scene
 
 if TYPE_CHECKING:
-    from cnpgen.recipes import Problem
+    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]

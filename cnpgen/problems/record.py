@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.library import restore_dataset_recipe
-from cnpgen.recipes import Problem, resolved
+from cnpgen.problems.load import restore_problem
+from cnpgen.problems.problem import Problem, resolved
 from cnpgen.store.files.documents import canonical_sha256, plain
 from cnpgen.trajectory.spec import TrajectorySpec
 
@@ -40,7 +40,7 @@ class ProblemRecord:
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """The resolved problem, as ``cnpgen.recipes.resolved`` returns it.
+        """The resolved problem, as ``cnpgen.problems.problem.resolved`` returns it.
 
         Raises:
             ValueError: The text is not the JSON of a problem.
@@ -85,10 +85,8 @@ class ProblemRecord:
         Raises:
             RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
         """
-        pipeline = {"name": self.name, "problem": self.content, "stage": [{"use": "at-rest", "end": "start"}]}
-        around = {"name": self.name, "pipeline": pipeline, "splits": {"train": 1}}  # what can be restored is datasets
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-            yield restore_dataset_recipe(around, self.urdf, Path(folder)).pipeline.problem
+            yield restore_problem(self.content, self.urdf, Path(folder))
 
     def tip_positions(self, q: Array) -> Array:
         """Compute where the tip is, with Pinocchio.
@@ -124,7 +122,7 @@ def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
     Raises:
         RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
     """
-    from cnpgen.robots.robot import load_robot
+    from cnpgen.problems.robot import load_robot
 
     with record.restored() as problem:
         robot = load_robot(problem)

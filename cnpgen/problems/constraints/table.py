@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:

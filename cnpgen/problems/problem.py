@@ -8,10 +8,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from cnpgen.constraints.clearance import ObjectContact
-from cnpgen.constraints.constraint import Constraint
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.stage import Stage
+from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.robots.spec import HeldObject, LimitSpec, Obstacle, RobotSpec
 from cnpgen.schema import registry
 from cnpgen.schema.keys import NAME, field, to_dict
@@ -176,3 +176,10 @@ def _use(obj: object) -> dict[str, str]:
             about = {"package": package, "source": source}
             return {"use": registry.name_of(group, type(obj)), **{key: text for key, text in about.items() if text}}
     return {}
+
+
+def problem_identity(problem: Problem) -> str:
+    """Digest of what kernels are built from: the problem as it is, wherever it came from, and its URDF."""
+    content = resolved(problem)
+    del content["title"], content["robot"]["urdf"]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode() + problem.urdf_path.read_bytes()).hexdigest()

@@ -1,0 +1,1 @@
+"""What a valid motion is: the problem, its constraints, its robot, and the problem as text."""

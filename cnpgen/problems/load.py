@@ -1,0 +1,113 @@
+"""Problems from files, by name or path, and from what was written down of them."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import PluginError, RecipeError, UsageError
+from cnpgen.problems.checks import problem_mistakes, tables
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.problem import Problem
+from cnpgen.schema import registry
+from cnpgen.schema.catalogue import digest_of, load_recipe, read_kind
+from cnpgen.schema.keys import Place
+from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.toml import read_table
+
+
+def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
+    """Load a problem.
+
+    Args:
+        name_or_path: Name of a shipped problem, or path of a problem file.
+        relative_to: Folder that a path is relative to; by default the working directory.
+
+    Raises:
+        RecipeError: With every mistake in the file.
+    """
+    return load_recipe(("problem",), name_or_path, relative_to, read_problem)
+
+
+def problem_of(problem: object) -> Problem:
+    """Return the problem that is meant: itself, or what its name or file says.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: With every mistake in the file.
+    """
+    if isinstance(problem, Problem):
+        return problem
+    if isinstance(problem, str | Path):
+        return load_problem(problem)
+    raise UsageError(f"problem must be the name of a problem, the path of a problem file or a Problem, got {problem!r}")
+
+
+def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
+    """Read a problem file and append what is wrong with it to ``mistakes``; None if it cannot be used."""
+    read = read_table(path, ("problem",), mistakes)
+    if read is None:
+        return None
+    data, table = read
+    where = Place(str(path))
+    readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
+    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
+    before = len(mistakes)
+    mistakes.extend(problem_mistakes(table, where, path.parent))
+    if problem is None or len(mistakes) > before:
+        return None
+    problem = replace(problem, path=path.absolute())
+    return replace(problem, digest=digest_of(data, problem.urdf_path.read_bytes()))
+
+
+def without_defaults(value: Any) -> Any:
+    """Leave out nulls, empty arrays and what is noted of plug-ins: in a recipe they are not said."""
+    if isinstance(value, dict):
+        said = {key: entry for key, entry in value.items() if entry is not None and entry != []}
+        if "use" in said:
+            said.pop("source", None)
+            said.pop("package", None)
+        return {key: without_defaults(entry) for key, entry in said.items()}
+    return [without_defaults(entry) for entry in value] if isinstance(value, list) else value
+
+
+def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
+    """Rebuild a problem from what ``resolved`` made of it.
+
+    Args:
+        content: The resolved problem.
+        urdf: Text of the robot's URDF file.
+        folder: Where the URDF file is written to.
+
+    Raises:
+        RecipeError: The content does not fit this version of cnpgen.
+        PluginError: A package that it needs is not installed.
+    """
+    if missing := missing_kinds(registry.CONSTRAINTS, tables(content, "constraint")):
+        raise PluginError(missing)
+    path, mistakes = folder / "recipe.toml", list[str]()
+    problem: Problem | None = restoring_reader(urdf, path)(without_defaults(content), Place(str(path)), mistakes)
+    if problem is None or mistakes:
+        raise RecipeError(mistakes)
+    return problem
+
+
+def restoring_reader(urdf: str, path: Path) -> Reader:
+    """Return what reads a resolved problem, its defaults left out, as if it stood in ``path``; write its URDF there."""
+    (path.parent / "robot.urdf").write_text(urdf, encoding="utf-8")
+
+    def read(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
+        value = {**value, "robot": {**value["robot"], "urdf": "robot.urdf"}}
+        readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
+        made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
+        digest = digest_of(json.dumps(value, sort_keys=True).encode(), urdf.encode())
+        return made and replace(made, path=path, digest=digest)
+
+    return read
+
+
+def missing_kinds(group: str, entries: list[tuple[int, dict[str, Any]]]) -> list[str]:
+    """Say which packages resolved tables of stages or constraints need that are not installed."""
+    found = (registry.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for _, each in entries)
+    return list(dict.fromkeys(text for text in found if text))
