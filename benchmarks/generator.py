@@ -16,9 +16,9 @@ from common import arguments, median, progress, report, table, verdict
 
 from cnpgen.describe import kind_name
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_pipeline
+from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stage import BLOCK_ROWS, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Batch, Run, Stage
 
 PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object")
 BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition

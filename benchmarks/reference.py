@@ -31,9 +31,9 @@ from pinocchio_scipy import (
 )
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_pipeline
+from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import BLOCK_ROWS, Batch
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Batch
 
 LOSS = 1e-6  # an objective this much below the reference's is a defeat
 

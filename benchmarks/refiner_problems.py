@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_pipeline
-from cnpgen.pipelines.hitting_configuration import HittingConfiguration
-from cnpgen.pipelines.hitting_velocity import HittingVelocity
+from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
+from cnpgen.pipelines.stages.stage import Batch
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem, record_problem
 from cnpgen.refine.engine import prepare, tasks_of

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation, evaluate_plans
     from cnpgen.export.plans import export_plans
     from cnpgen.interop.omega import Omega
-    from cnpgen.library import load_dataset_recipe, load_pipeline
+    from cnpgen.library import load_dataset_recipe
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
     from cnpgen.losses.metric import Metric
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from cnpgen.losses.quadrature import rotating_shift
     from cnpgen.losses.schedule import suggested_weights
     from cnpgen.make import make_dataset
+    from cnpgen.pipelines.load import load_pipeline
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner, states_at
     from cnpgen.plans.load import load_plans
@@ -72,7 +73,7 @@ _HOME = {
     "load_dataset": "loader.load",
     "load_dataset_recipe": "library",
     "load_model": "planner.model_file",
-    "load_pipeline": "library",
+    "load_pipeline": "pipelines.load",
     "load_plans": "plans.load",
     "load_problem": "problems.load",
     "load_problems": "solving",

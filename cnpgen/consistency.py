@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cnpgen.errors import DatasetError
 from cnpgen.library import restore_dataset_recipe
-from cnpgen.problems.problem import DatasetRecipe, resolved_digest
+from cnpgen.recipe import DatasetRecipe, resolved_digest
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.files.documents import load_document, plain

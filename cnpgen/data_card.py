@@ -1,7 +1,7 @@
 """The data card that a user keeps beside the recipe of a dataset."""
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.problem import DatasetRecipe
+from cnpgen.recipe import DatasetRecipe
 
 
 def load_notes(recipe: DatasetRecipe) -> str:

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cnpgen.pipelines.stage import Stage
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.problem import DatasetRecipe, Pipeline, Problem, recipe_digest, resolved
+from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.robot import load_robot
+from cnpgen.recipe import DatasetRecipe, recipe_digest
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, Range, keys
@@ -147,7 +149,7 @@ def describe_kind(group: str, name: str) -> str:
     """Describe a kind of stage or constraint: what it does, and the keys of its table.
 
     Args:
-        group: ``plugins.STAGES`` or ``plugins.CONSTRAINTS``.
+        group: ``registry.STAGES`` or ``registry.CONSTRAINTS``.
         name: Name of the kind.
 
     Raises:
@@ -156,7 +158,7 @@ def describe_kind(group: str, name: str) -> str:
     kind = registry.load(group, name)
     head = ("key", "default", "meaning (value)")
     rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
-    noun = registry.BASES[group].__name__.lower()
+    noun = registry.noun_of(group)
     text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
     return "\n".join([f"{noun} {name}", *_title(kind_summary(kind)), "", *text])
 
@@ -187,7 +189,7 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
         }
         for key in keys(kind)
     ]
-    noun = registry.BASES[group].__name__.lower()
+    noun = registry.noun_of(group)
     return {"kind": noun, "name": name, "summary": kind_summary(kind), "keys": entries}
 
 

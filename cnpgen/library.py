@@ -6,28 +6,18 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import PluginError, RecipeError, UsageError
-from cnpgen.pipelines.stage import Stage
+from cnpgen.pipelines.load import read_pipeline
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
-from cnpgen.problems.load import missing_kinds, read_problem, restoring_reader, without_defaults
-from cnpgen.problems.problem import DatasetRecipe, Pipeline, Problem
+from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
+from cnpgen.problems.problem import Problem
+from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import digest_of, find_file, load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind, is_kind, read_table
-
-
-def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) -> Pipeline:
-    """Load a pipeline and its problem.
-
-    Args:
-        name_or_path: Name of a shipped pipeline, or path of a pipeline file.
-        relative_to: Folder that a path is relative to; by default the working directory.
-
-    Raises:
-        RecipeError: With every mistake in both files.
-    """
-    return load_recipe(("pipeline",), name_or_path, relative_to, _pipeline)
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
@@ -111,28 +101,15 @@ def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | Non
         raise RecipeError([str(error)]) from error
 
 
-def _pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
-    read = read_table(path, ("pipeline",), mistakes)
-    if read is None:
-        return None
-    data, table = read
-    readers: dict[type, Reader] = {
-        Stage: partial(read_kind, registry.STAGES),
-        Problem: reference("problem", read_problem, path.parent),
-    }
-    made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
-    return made and replace(made, path=path.absolute(), digest=digest_of(data, made.problem.digest.encode()))
-
-
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
     read = read_table(path, ("dataset", "pipeline"), mistakes)
     if read is None:
         return None
     data, table = read
     if not is_kind("dataset", table) and is_kind("pipeline", table):
-        pipeline = _pipeline(path, mistakes)
+        pipeline = read_pipeline(path, mistakes)
         return _wrapped(pipeline) if pipeline else None
-    readers: dict[type, Reader] = {Pipeline: reference("pipeline", _pipeline, path.parent)}
+    readers: dict[type, Reader] = {Pipeline: reference("pipeline", read_pipeline, path.parent)}
     made = parse(DatasetRecipe, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
     return made and replace(made, path=path.absolute(), digest=digest_of(data, made.pipeline.digest.encode()))
 

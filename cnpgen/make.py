@@ -16,8 +16,8 @@ from cnpgen.library import dataset_recipe_of
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.make_plan import dataset_folder, plan_dataset
 from cnpgen.make_shard import Job, make_shards
-from cnpgen.pipelines.stage import BLOCK_ROWS
-from cnpgen.problems.problem import DatasetRecipe
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS
+from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.check import check_documents

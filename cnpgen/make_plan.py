@@ -10,7 +10,8 @@ from cnpgen.library import dataset_recipe_of
 from cnpgen.machine.versions import versions
 from cnpgen.make_shard import Job
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.problems.problem import DatasetRecipe, recipe_digest, resolved, split_rows
+from cnpgen.problems.problem import resolved
+from cnpgen.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import DatasetPlan, default_shard_size, load_plan
 

@@ -14,8 +14,8 @@ from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend
 from cnpgen.machine.versions import versions
 from cnpgen.pipelines.piece import Block
+from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.problems.problem import Pipeline
 from cnpgen.store.blueprint import DatasetPlan, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.outcome import Outcome, merge_outcomes

@@ -1,7 +1,7 @@
 """What packages with stages and constraints of their own import: these names stay here, wherever their modules are."""
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Batch, Stage
+from cnpgen.pipelines.stages.stage import Batch, Stage
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field

@@ -12,7 +12,7 @@ from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
 from cnpgen.make_shard import blocks_of, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.problems.problem import DatasetRecipe, recipe_digest
+from cnpgen.recipe import DatasetRecipe, recipe_digest
 from cnpgen.store.blueprint import REVISION, DatasetPlan, ShardTask
 from cnpgen.store.check import Finding
 from cnpgen.store.reader import StoredDataset

@@ -14,8 +14,8 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.library import dataset_recipe_of
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.problem import DatasetRecipe
 from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 

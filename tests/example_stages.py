@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from cnpgen.pipelines.stage import Stage
+from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.schema.keys import Range, field
 
 

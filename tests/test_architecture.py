@@ -195,6 +195,6 @@ zero = np.zeros((1, robot.n))
 fields = {"start_q": zero, "start_dq": zero, "start_ddq": zero, "goal_q": zero, "goal_dq": zero}
 verify_rows(problem, robot, {**fields, "start_xyz": np.ones((1, 3)), "goal_xyz": np.ones((1, 3))})
 apart = ("cnpgen.kernels", "cnpgen.pipelines.", "cnpgen.symbolic.state", "cnpgen.symbolic.boxes", "casadi")
-print("LOADED", *sorted(m for m in sys.modules if m.startswith(apart) and m != "cnpgen.pipelines.stage"))
+print("LOADED", *sorted(m for m in sys.modules if m.startswith(apart) and m != "cnpgen.pipelines.stages.stage"))
 """
     assert python(code) == "LOADED"

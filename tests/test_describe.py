@@ -19,7 +19,8 @@ from cnpgen.describe import (
     table,
 )
 from cnpgen.errors import RecipeError
-from cnpgen.library import load_dataset_recipe, load_pipeline
+from cnpgen.library import load_dataset_recipe
+from cnpgen.pipelines.load import load_pipeline
 from cnpgen.problems.load import load_problem
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes

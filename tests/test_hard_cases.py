@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from conftest import Prepare
 
-from cnpgen.pipelines.hitting_configuration import HittingConfiguration
-from cnpgen.pipelines.hitting_newton import objective
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.stages.hitting_newton import objective
+from cnpgen.pipelines.stages.stage import Batch
 
 CASES = json.loads((Path(__file__).parent / "data" / "hitting_configurations.json").read_text())
 

@@ -284,7 +284,7 @@ def test_a_loop_s_lanes_do_not_depend_on_their_neighbours(root, cache_folder, ba
 @pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
 @pytest.mark.parametrize("kind", ["inverse kinematics", "hitting configuration"])
 def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, backend, kind):
-    from cnpgen.pipelines import hitting_newton, ik
+    from cnpgen.pipelines.stages import hitting_newton, ik
 
     kernels, robot = prepare("airhockey-replan", backend).context.kernels, prepare("airhockey-replan").context.robot
     random = np.random.default_rng(7)
@@ -325,7 +325,7 @@ def test_tapes_come_back_from_their_bytes_as_they_were(mixed, root):
 
 
 def test_a_function_that_is_built_twice_gives_the_same_bytes(prepare):
-    from cnpgen.pipelines.ik import ik_step
+    from cnpgen.pipelines.stages.ik import ik_step
 
     robot = prepare("heavy-object").context.robot
     first, second = (tape_from_function(ik_step(robot, vertical=True, max_step=0.8)).to_bytes() for _ in range(2))
@@ -386,7 +386,7 @@ def machine_flags() -> set[str]:
 def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
     prepare: Prepare, tmp_path, monkeypatch, march, needs
 ):
-    from cnpgen.pipelines import ik, motion
+    from cnpgen.pipelines.stages import ik, motion
 
     monkeypatch.setattr(compiled_module, "vector_flags", lambda: (f"-march={march}",))
     library = prepare("airhockey-replan").context.kernels
@@ -553,7 +553,8 @@ def repository() -> Path:
 WARM_START = """
 import sys
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_pipeline
+from cnpgen.pipelines.load import load_pipeline
+
 from cnpgen.pipelines.prepared import PreparedPipeline
 backend, folder = choose_backend(sys.argv[1])
 for name in ("airhockey-hit", "airhockey-replan", "heavy-object"):

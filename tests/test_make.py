@@ -21,7 +21,7 @@ from cnpgen.make import is_quick, make_dataset, runs
 from cnpgen.make_plan import plan_dataset
 from cnpgen.make_shard import Job, make_shards, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stage import BLOCK_ROWS
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.store.blueprint import load_plan, shards
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import load_manifest

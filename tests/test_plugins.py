@@ -7,7 +7,7 @@ import pytest
 from example_stages import Idle
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.stage import Stage
+from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
@@ -89,8 +89,8 @@ def test_a_kind_of_the_other_group_is_unknown(register):
     [
         ("no_such_module_of_anyone:Stage", "ModuleNotFoundError"),
         (f"{__name__}:Missing", "AttributeError"),
-        (f"{__name__}:THE_STRING", "is not a subclass of cnpgen.pipelines.stage.Stage, got 'not a class'"),
-        ("builtins:dict", "is not a subclass of cnpgen.pipelines.stage.Stage"),
+        (f"{__name__}:THE_STRING", "is not a subclass of cnpgen.pipelines.stages.stage.Stage, got 'not a class'"),
+        ("builtins:dict", "is not a subclass of cnpgen.pipelines.stages.stage.Stage"),
         (f"{__name__}:Abstract", "Abstract is abstract, it does not define prepare, provides"),
         (f"{__name__}:NotADataclass", "NotADataclass is not a dataclass"),
         (f"{__name__}:Undeclared", "the field 'loaded' is not declared with cnpgen.plugins.field"),
@@ -148,11 +148,11 @@ def test_name_of_an_unregistered_class_says_where_it_is(register):
 
 
 def test_every_group_has_a_base():
-    assert {STAGES: Stage, CONSTRAINTS: Constraint} == registry.BASES
-    assert registry.BASES.keys() == registry.BUILT_IN.keys()
+    assert {group: registry.contract(group) for group in registry.BUILT_IN} == {STAGES: Stage, CONSTRAINTS: Constraint}
+    assert registry.CONTRACTS.keys() == registry.BUILT_IN.keys()
 
 
-@pytest.mark.parametrize("group", registry.BASES)
+@pytest.mark.parametrize("group", registry.CONTRACTS)
 def test_every_built_in_kind_can_be_loaded(group):
     for name in registry.BUILT_IN[group]:
         assert name_of(group, load(group, name)) == name

@@ -8,10 +8,10 @@ import pytest
 from conftest import SHIPPED, Prepare, needs_compiler
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
-from cnpgen.pipelines.stage import BLOCK_ROWS, Batch
+from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Batch
 from cnpgen.store.field import Field
 from cnpgen.store.outcome import Outcome, merge_outcomes
 

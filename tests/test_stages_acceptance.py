@@ -9,7 +9,7 @@ from conftest import SHIPPED, Prepare, needs_compiler, run_stages
 
 from cnpgen.pipelines.acceptance import _unmet, acceptance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.stage import Batch
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 STATES = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")]

@@ -10,10 +10,11 @@ from conftest import Arm, Prepare, needs_compiler, run_stages, without_stages
 from scipy.optimize import linprog
 
 from cnpgen.kernels.tape import Loop
-from cnpgen.library import find_recipe, load_pipeline
-from cnpgen.pipelines.braking import MAX_STEPS, STEP, SUSPECT, BrakingReach, braking_step, overshoot, tip_state
+from cnpgen.library import find_recipe
+from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.braking import MAX_STEPS, STEP, SUSPECT, BrakingReach, braking_step, overshoot, tip_state
+from cnpgen.pipelines.stages.stage import Batch
 from cnpgen.problems.constraints.table import Table
 
 Array = np.ndarray

@@ -8,9 +8,9 @@ import pytest
 from conftest import Prepare, needs_compiler, run_stages
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.collision import Collision, coal_judge, skeleton_distance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.collision import Collision, coal_judge, skeleton_distance
+from cnpgen.pipelines.stages.stage import Batch
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.world.state import World
 

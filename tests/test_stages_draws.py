@@ -8,11 +8,11 @@ from conftest import SHIPPED, Prepare, run_stages
 from scipy.stats import chi2_contingency, chisquare, ks_2samp, kstest
 
 from cnpgen.errors import RecipeError
-from cnpgen.library import load_pipeline
-from cnpgen.pipelines.draw import DrawPositions
-from cnpgen.pipelines.hit_angle import wrap
+from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.draw import DrawPositions
+from cnpgen.pipelines.stages.hit_angle import wrap
+from cnpgen.pipelines.stages.stage import Batch
 from cnpgen.schema.keys import Range
 
 DRAWS = 40_000
@@ -194,7 +194,7 @@ def test_moving_starts_reach_a_uniform_fraction_of_their_tightest_limit(prepare)
 
 
 def test_accelerations_are_uniform_in_the_interval_that_the_limits_leave(prepare):
-    from cnpgen.pipelines.motion import table_acceleration
+    from cnpgen.pipelines.stages.motion import table_acceleration
 
     prepared = prepare("airhockey-replan")
     kernel = prepared.context.kernels.load(table_acceleration)

@@ -9,9 +9,9 @@ from conftest import Arm, Prepare, run_stages
 from scipy.optimize import minimize
 
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.hitting_configuration import HittingConfiguration
-from cnpgen.pipelines.hitting_newton import basic_joints, newton_step
-from cnpgen.pipelines.ik import MAX_STEPS, TOLERANCE, ik_step
+from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.stages.hitting_newton import basic_joints, newton_step
+from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, ik_step
 from cnpgen.robots.robot import Robot
 
 Array = np.ndarray

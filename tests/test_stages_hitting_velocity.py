@@ -7,8 +7,8 @@ import pytest
 from conftest import Arm, Prepare, needs_compiler, run_stages
 from scipy.optimize import linprog
 
-from cnpgen.pipelines.hitting_velocity import HittingVelocity, hitting_velocity
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity, hitting_velocity
+from cnpgen.pipelines.stages.stage import Batch
 
 Array = np.ndarray
 HALF = np.sqrt(0.5)

@@ -8,9 +8,9 @@ from conftest import Arm, Prepare, run_stages
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.ik import MAX_STEPS, TOLERANCE, GoalIK, ik_step
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, GoalIK, ik_step
+from cnpgen.pipelines.stages.stage import Batch
 
 EXACT = 1e-9  # m and rad
 ENDS = [("airhockey-hit", "start"), ("airhockey-replan", "start"), ("heavy-object", "start"), ("heavy-object", "goal")]

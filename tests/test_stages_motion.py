@@ -7,10 +7,10 @@ import pytest
 from conftest import Arm, Prepare, run_stages
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.motion import TableAcceleration, TableVelocity, table_acceleration, table_velocity
+from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stage import Batch
-from cnpgen.problems.problem import Pipeline
+from cnpgen.pipelines.stages.motion import TableAcceleration, TableVelocity, table_acceleration, table_velocity
+from cnpgen.pipelines.stages.stage import Batch
 
 EXACT = 1e-9  # m/s and m/s^2
 DRAWS = 2000

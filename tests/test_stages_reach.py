@@ -8,8 +8,8 @@ from conftest import Arm, Prepare, run_stages, without_stages
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.prepared import random_generator
-from cnpgen.pipelines.reach import BallisticReach
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.reach import BallisticReach
+from cnpgen.pipelines.stages.stage import Batch
 from cnpgen.problems.constraints.table import Table
 
 

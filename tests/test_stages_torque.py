@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import Arm, Prepare, needs_compiler, run_stages
 
-from cnpgen.pipelines.torque import GravityTorque, torque_ratio
+from cnpgen.pipelines.stages.torque import GravityTorque, torque_ratio
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 

@@ -651,7 +651,7 @@ robot = load_robot(problem)
 names = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq")]
 columns = {name: np.zeros((1, 7)) for name in names} | {"start_xyz": np.zeros((1, 3)), "goal_xyz": np.zeros((1, 3))}
 verify_rows(problem, robot, columns)
-allowed = {"cnpgen.pipelines", "cnpgen.pipelines.stage"}
+allowed = {"cnpgen.pipelines", "cnpgen.pipelines.stages.stage"}
 symbolic = [f"cnpgen.robots.{name}" for name in ("symbolic", "boxes", "linalg")]
 parts = ("cnpgen.kernels", "cnpgen.pipelines", "casadi", *symbolic)
 print(sorted(name for name in sys.modules if name.startswith(parts) and name not in allowed))

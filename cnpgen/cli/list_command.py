@@ -73,7 +73,7 @@ def _models() -> list[dict[str, Any]]:
 
 
 def _pipelines() -> list[dict[str, Any]]:
-    from cnpgen.library import load_pipeline
+    from cnpgen.pipelines.load import load_pipeline
     from cnpgen.schema.catalogue import list_recipes
 
     entries = []

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from cnpgen.make import MadeDataset
-    from cnpgen.problems.problem import DatasetRecipe
+    from cnpgen.recipe import DatasetRecipe
     from cnpgen.store.outcome import Outcome
 
 KEPT = "finished shards are kept, run the same command again to go on"

@@ -14,7 +14,7 @@ from cnpgen.store.shard import storage_dtype
 from cnpgen.store.workspace import check_clearable, holds_plan, is_dataset
 
 if TYPE_CHECKING:
-    from cnpgen.problems.problem import DatasetRecipe
+    from cnpgen.recipe import DatasetRecipe
 
 SHARD_OVERHEAD = 41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
 DOCUMENTS = 90_000  # bytes: plan, manifest, card and statistics

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.pipelines.collision import sample_tops
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run
+from cnpgen.pipelines.stages.collision import sample_tops
+from cnpgen.pipelines.stages.stage import Array, Batch, Run
 from cnpgen.problems.constraints.constraint import EXACTNESS, End
 from cnpgen.problems.problem import Problem
 from cnpgen.store.field import Field

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.pipelines.stage import Batch
+from cnpgen.pipelines.stages.stage import Batch
 from cnpgen.pipelines.tally import Tally
 from cnpgen.store.field import Field
 from cnpgen.store.outcome import Outcome

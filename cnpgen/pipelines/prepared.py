@@ -12,9 +12,10 @@ from cnpgen.kernels.library import Backend, KernelLibrary
 from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.piece import Block, Piece
-from cnpgen.pipelines.stage import Array, Batch, Run
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.stage import Array, Batch, Run
 from cnpgen.problems.constraints.constraint import EXACTNESS
-from cnpgen.problems.problem import Pipeline, problem_identity
+from cnpgen.problems.problem import problem_identity
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.store.field import Field

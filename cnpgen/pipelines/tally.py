@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.pipelines.stage import Array, Batch
+from cnpgen.pipelines.stages.stage import Array, Batch
 from cnpgen.store.field import Field
 from cnpgen.store.outcome import DensityMap, Outcome
 

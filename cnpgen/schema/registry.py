@@ -13,30 +13,31 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import RecipeError, nearest
-from cnpgen.pipelines.stage import Stage
-from cnpgen.problems.constraints.constraint import Constraint
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
 
-BASES: dict[str, type] = {STAGES: Stage, CONSTRAINTS: Constraint}
+CONTRACTS: dict[str, str] = {  # what a kind is a subclass of
+    STAGES: "cnpgen.pipelines.stages.stage:Stage",
+    CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
+}
 
 BUILT_IN: dict[str, dict[str, str]] = {
     STAGES: {
-        "draw-positions": "cnpgen.pipelines.draw:DrawPositions",
-        "start-ik": "cnpgen.pipelines.ik:StartIK",
-        "goal-ik": "cnpgen.pipelines.ik:GoalIK",
-        "hit-angle-to-goal": "cnpgen.pipelines.hit_angle:HitAngleToGoal",
-        "hit-angle-in-cone": "cnpgen.pipelines.hit_angle:HitAngleInCone",
-        "hitting-configuration": "cnpgen.pipelines.hitting_configuration:HittingConfiguration",
-        "hitting-velocity": "cnpgen.pipelines.hitting_velocity:HittingVelocity",
-        "at-rest": "cnpgen.pipelines.motion:AtRest",
-        "table-velocity": "cnpgen.pipelines.motion:TableVelocity",
-        "table-acceleration": "cnpgen.pipelines.motion:TableAcceleration",
-        "ballistic-reach": "cnpgen.pipelines.reach:BallisticReach",
-        "braking-reach": "cnpgen.pipelines.braking:BrakingReach",
-        "collision": "cnpgen.pipelines.collision:Collision",
-        "gravity-torque": "cnpgen.pipelines.torque:GravityTorque",
+        "draw-positions": "cnpgen.pipelines.stages.draw:DrawPositions",
+        "start-ik": "cnpgen.pipelines.stages.ik:StartIK",
+        "goal-ik": "cnpgen.pipelines.stages.ik:GoalIK",
+        "hit-angle-to-goal": "cnpgen.pipelines.stages.hit_angle:HitAngleToGoal",
+        "hit-angle-in-cone": "cnpgen.pipelines.stages.hit_angle:HitAngleInCone",
+        "hitting-configuration": "cnpgen.pipelines.stages.hitting_configuration:HittingConfiguration",
+        "hitting-velocity": "cnpgen.pipelines.stages.hitting_velocity:HittingVelocity",
+        "at-rest": "cnpgen.pipelines.stages.motion:AtRest",
+        "table-velocity": "cnpgen.pipelines.stages.motion:TableVelocity",
+        "table-acceleration": "cnpgen.pipelines.stages.motion:TableAcceleration",
+        "ballistic-reach": "cnpgen.pipelines.stages.reach:BallisticReach",
+        "braking-reach": "cnpgen.pipelines.stages.braking:BrakingReach",
+        "collision": "cnpgen.pipelines.stages.collision:Collision",
+        "gravity-torque": "cnpgen.pipelines.stages.torque:GravityTorque",
         "certified-plan": "cnpgen.certification:CertifiedPlan",
     },
     CONSTRAINTS: {
@@ -76,7 +77,7 @@ def load(group: str, name: str) -> type[Any]:
         RecipeError: The kind is unknown, defined twice, or cannot be imported.
     """
     sources = _sources(group, name)
-    noun = BASES[group].__name__.lower()
+    noun = noun_of(group)
     if not sources:
         known = names(group)
         hint = nearest(name, known)
@@ -84,7 +85,24 @@ def load(group: str, name: str) -> type[Any]:
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))
-    return _imported(importer, f"{noun} {name!r} of {source}", base=BASES[group])
+    return _imported(importer, f"{noun} {name!r} of {source}", base=contract(group))
+
+
+def contract(group: str) -> type[Any]:
+    """Import the class that every kind of a group is a subclass of."""
+    kind: type[Any] = _named(CONTRACTS[group])
+    return kind
+
+
+def noun_of(group: str) -> str:
+    """Say what a kind of a group is: "stage" or "constraint"."""
+    return CONTRACTS[group].partition(":")[2].lower()
+
+
+def group_of(kind: type) -> str:
+    """Return the group that a class is a kind of; empty if it is none."""
+    bases = {f"{base.__module__}:{base.__qualname__}" for base in kind.__mro__}
+    return next((group for group, name in CONTRACTS.items() if name in bases), "")
 
 
 def name_of(group: str, kind: type) -> str:
@@ -141,7 +159,7 @@ def why_missing(group: str, use: str, package: str) -> str:
     """
     if use in names(group):
         return ""
-    noun = BASES[group].__name__.lower()
+    noun = noun_of(group)
     if not package:
         return f"{noun} {use!r} is not installed: install the package that registers it (entry point group {group!r})"
     return (
@@ -160,13 +178,18 @@ def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
     """List who defines a kind, and how to import it from there."""
     found: dict[str, Callable[[], Any]] = {}
     if name in BUILT_IN[group]:
-        module, _, attribute = BUILT_IN[group][name].partition(":")
-        found["cnpgen"] = lambda: getattr(importlib.import_module(module), attribute)
+        found["cnpgen"] = lambda: _named(BUILT_IN[group][name])
     for entry in installed(group):
         if entry.name == name:
             package = entry.dist.name if entry.dist else "an installed package"
             found[f"{package} ({entry.value})"] = entry.load
     return found
+
+
+def _named(spec: str) -> Any:
+    """Import what ``"module:name"`` says."""
+    module, _, attribute = spec.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def _imported(importer: Callable[[], Any], what: str, *, base: type) -> type[Any]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 

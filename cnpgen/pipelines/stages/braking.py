@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field

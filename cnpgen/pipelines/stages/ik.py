@@ -8,8 +8,8 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.draw import uniform
-from cnpgen.pipelines.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.draw import uniform
+from cnpgen.pipelines.stages.stage import Batch, Run, Stage
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, add, dot, gram, scale, solve, subtract

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem

@@ -6,7 +6,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.hitting_limits import held_step, within_limits
-from cnpgen.pipelines.hitting_newton import MAX_STEPS, TOLERANCE, basic_joints, newton_step, objective
-from cnpgen.pipelines.ik import MAX_STEPS as IK_STEPS
-from cnpgen.pipelines.ik import TOLERANCE as IK_TOLERANCE
-from cnpgen.pipelines.ik import ik_step
-from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.hitting_limits import held_step, within_limits
+from cnpgen.pipelines.stages.hitting_newton import MAX_STEPS, TOLERANCE, basic_joints, newton_step, objective
+from cnpgen.pipelines.stages.ik import MAX_STEPS as IK_STEPS
+from cnpgen.pipelines.stages.ik import TOLERANCE as IK_TOLERANCE
+from cnpgen.pipelines.stages.ik import ik_step
+from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Batch, Run, Stage
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field

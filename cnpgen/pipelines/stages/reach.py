@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field

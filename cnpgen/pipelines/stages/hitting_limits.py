@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.pipelines.hitting_newton import TOLERANCE, Expansion, expand, safeguard, shortened
-from cnpgen.pipelines.stage import Array
+from cnpgen.pipelines.stages.hitting_newton import TOLERANCE, Expansion, expand, safeguard, shortened
+from cnpgen.pipelines.stages.stage import Array
 from cnpgen.symbolic.linalg import Scalar, add, dot, factorize, gram, scale, solve, substitute, subtract
 from cnpgen.symbolic.state import Vec, symbols
 

@@ -1,0 +1,22 @@
+"""Pipeline: how the boundary conditions of a problem are drawn."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.problems.problem import Problem
+from cnpgen.schema.keys import NAME, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline:
+    """How the boundary conditions of a problem are drawn."""
+
+    name: str = field("name of the pipeline: lower-case letters, digits and hyphens", pattern=NAME)
+    title: str = field("one line about it", default="")
+    problem: Problem = field(
+        "name of a shipped problem, or path of a problem file relative to this one", form="a name or a path"
+    )
+    stage: tuple[Stage, ...] = field("the steps, in order", form="[[stage]] tables")
+    path: Path = Path()
+    digest: str = ""
