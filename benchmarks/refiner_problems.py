@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
@@ -24,7 +25,6 @@ from cnpgen.refine.tip_bound import Arm
 from cnpgen.solving import problems_of_rows
 from cnpgen.trajectory.boundary import assemble
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.verdict import Verdict
 
 Array = NDArray[np.float64]
 PUCKS_X, PUCKS_Y = np.linspace(0.8, 1.2, 9), np.linspace(-0.4, 0.4, 9)  # m

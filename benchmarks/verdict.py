@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from common import arguments, median, report, table, verdict
 
+from cnpgen.judges.plans import Verdict, judge
+from cnpgen.judges.plans.course import course
+from cnpgen.judges.plans.sampling import sample, time_table
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.verdict import Verdict, judge
-from cnpgen.verdict.course import course
-from cnpgen.verdict.sampling import sample, time_table
 from cnpgen.world.state import World
 
 STEP = 1e-3  # s

@@ -136,7 +136,7 @@ def check_plans(problem: Problem, robot: "Robot", columns: Mapping[str, NDArray[
         robot: Its robot.
         columns: Field -> values, shape (rows, width) or (rows,).
     """
-    from cnpgen.verdict.judge import judge
+    from cnpgen.judges.plans.judge import judge
 
     if "path_control_points" not in columns:
         return PlanCheck()

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from cnpgen.certification import PlanCheck, check_plans
 from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError, counted
+from cnpgen.judges.rows.report import RowReport, merge
+from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.machine.workers import share_out
 from cnpgen.problems.robot import load_robot
 from cnpgen.shard_checks import check_numbers
@@ -20,8 +22,6 @@ from cnpgen.store.blueprint import DatasetPlan, ShardTask
 from cnpgen.store.check import DELETE, Finding
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
-from cnpgen.verify.report import RowReport, merge
-from cnpgen.verify.rows import verify_rows
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import counted
+from cnpgen.judges.plans import Reason, Verdict, judge, summarise
+from cnpgen.judges.plans.judge import check_step
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.record import open_problem
-from cnpgen.verdict import Reason, Verdict, judge, summarise
-from cnpgen.verdict.judge import check_step
 
 FORMAT = "cnpgen-evaluation"
 FORMAT_VERSION = 1

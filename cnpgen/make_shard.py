@@ -141,7 +141,7 @@ def spot_check(
     Raises:
         MachineError: A row is not what the kernels said it is.
     """
-    from cnpgen.verify.rows import verify_rows
+    from cnpgen.judges.rows.verify import verify_rows
 
     rows = np.unique(np.linspace(0, task.rows - 1, SPOT_CHECKS).astype(int))
     some = {name: values[rows] for name, values in columns.items()}

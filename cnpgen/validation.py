@@ -8,6 +8,7 @@ from typing import Any
 from cnpgen.consistency import check_recipe, check_statistics, restored
 from cnpgen.deep_check import DeepCheck, check_rows
 from cnpgen.errors import DatasetError, counted
+from cnpgen.judges.rows.report import RowReport
 from cnpgen.machine.workers import worker_count
 from cnpgen.regeneration import Regeneration, backend_of, make_again
 from cnpgen.schema.arguments import integer
@@ -17,7 +18,6 @@ from cnpgen.store.layout import PLAN
 from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
-from cnpgen.verify.report import RowReport
 
 
 @dataclass(frozen=True)

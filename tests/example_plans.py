@@ -10,13 +10,13 @@ import pinocchio as pin
 from scipy.integrate import simpson
 from scipy.interpolate import BSpline
 
+from cnpgen.judges.plans import Verdict, judge
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict import Verdict, judge
 
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
 ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 from example_plans import PROBLEMS, ROBOTS, Plan
 
+from cnpgen.judges.plans import Verdict, judge
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
 from cnpgen.problems.obstacles import obstacle_tops
@@ -16,7 +17,6 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Refined, Task
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict import Verdict, judge
 from cnpgen.world.state import World
 
 

@@ -188,7 +188,7 @@ import sys
 import numpy as np
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.verify.rows import verify_rows
+from cnpgen.judges.rows.verify import verify_rows
 problem = load_problem("heavy-object")
 robot = load_robot(problem)
 zero = np.zeros((1, robot.n))

@@ -14,8 +14,8 @@ from plan_files import garbage, plans_of
 import cnpgen.evaluation
 from cnpgen.errors import UsageError
 from cnpgen.evaluation import evaluate_plans
+from cnpgen.judges.plans import Verdict, judge
 from cnpgen.plans import PlanStatus, load_plans, save_plans
-from cnpgen.verdict import Verdict, judge
 
 
 def told(verdicts: Iterable[Verdict]) -> list[dict[str, Any]]:

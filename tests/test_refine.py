@@ -10,6 +10,7 @@ from example_plans import PROBLEMS, Plan, load, raised
 from example_refiner import library, refine, refiner, refiner_of, task, tops, verdict
 
 from cnpgen.errors import UsageError
+from cnpgen.judges.plans import Verdict
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.refine import sqp
@@ -30,7 +31,6 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import chebyshev
-from cnpgen.verdict import Verdict
 from cnpgen.world.state import World
 
 LABELS = ("hit", "replan", "transport")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from example_plans import bent, load
 
-from cnpgen.verdict import Margin
-from cnpgen.verdict.closer import intervals, keep_worse
+from cnpgen.judges.plans import Margin
+from cnpgen.judges.plans.closer import intervals, keep_worse
 
-judge_module = import_module("cnpgen.verdict.judge")  # the package has a function of the same name
+judge_module = import_module("cnpgen.judges.plans.judge")  # the package has a function of the same name
 
 
 @pytest.mark.parametrize(("by", "seed"), [(0.0, 0), (0.005, 3), (0.01, 5), (0.02, 2)])
@@ -72,7 +72,7 @@ def test_at_either_end_there_is_one_interval_and_nan_is_no_trouble() -> None:
 def test_of_more_intervals_than_can_be_looked_into_those_that_hide_most_are_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("cnpgen.verdict.closer.MOST", 2)
+    monkeypatch.setattr("cnpgen.judges.plans.closer.MOST", 2)
     distances, corners = moving([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [9.0, 9.0, 20.0, 9.1, 30.0])
     assert intervals(distances, corners, 0.0).tolist() == [0, 2, 4]
 

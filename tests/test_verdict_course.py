@@ -6,8 +6,8 @@ from example_plans import KNOTS, load
 from example_plans import course as reference
 from scipy.interpolate import BSpline
 
+from cnpgen.judges.plans.course import course, jerks
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.course import course, jerks
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])

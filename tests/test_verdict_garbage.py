@@ -9,7 +9,7 @@ import pytest
 from example_plans import Plan, bent, joined, load
 
 from cnpgen.errors import UsageError
-from cnpgen.verdict import Reason, judge, summarise
+from cnpgen.judges.plans import Reason, judge, summarise
 
 
 def _with(plan: Plan, what: str, index: tuple[int, ...], value: float) -> Plan:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from example_plans import PROBLEMS, ROBOTS, load
 
+from cnpgen.judges.plans.measure import name_part
 from cnpgen.problems.constraints.constraint import Condition
-from cnpgen.verdict.parts import name_part
 from cnpgen.world.state import World
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from example_plans import load
 
+from cnpgen.judges.plans.sampling import AT_ENDS, FEWEST, LONGEST, sample, table_phases, time_table
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.sampling import AT_ENDS, FEWEST, LONGEST, sample, table_phases, time_table
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from example_plans import bent, joined, load
 
-from cnpgen.verdict import Margin, Metrics, Verdict, judge, summarise
+from cnpgen.judges.plans import Margin, Metrics, Verdict, judge, summarise
 
 
 def verdicts_of_hits() -> list[Verdict]:

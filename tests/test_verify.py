@@ -13,16 +13,16 @@ import pytest
 from scipy.optimize import linprog, minimize_scalar
 
 from cnpgen.errors import DatasetError, RecipeError
+from cnpgen.judges.rows import verify as rows_module
+from cnpgen.judges.rows.fastest_hit import highest_speed
+from cnpgen.judges.rows.report import Check, RowReport, merge
+from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
-from cnpgen.verify import rows as rows_module
-from cnpgen.verify.fastest_hit import highest_speed
-from cnpgen.verify.report import Check, RowReport, merge
-from cnpgen.verify.rows import verify_rows
 from cnpgen.world.scene import Scene
 from cnpgen.world.state import World
 
@@ -645,7 +645,7 @@ import sys
 import numpy as np
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.verify.rows import verify_rows
+from cnpgen.judges.rows.verify import verify_rows
 problem = load_problem("heavy-object")
 robot = load_robot(problem)
 names = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq")]

@@ -13,7 +13,7 @@ from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation
-    from cnpgen.verdict import Verdict
+    from cnpgen.judges.plans import Verdict
 
 _TEXT = """\
 Every plan is looked at on a fine time grid and judged for itself; docs/verdict.md says by what. The exit code is 0 if

@@ -9,7 +9,7 @@ from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.evaluation import Evaluation
-    from cnpgen.verdict import Verdict
+    from cnpgen.judges.plans import Verdict
 
 METRICS = {  # metric -> what it is called, in a summary and in a list, and its format
     "duration_s": ("motion time [s]", "T [s]", "{:.4f}"),
@@ -61,9 +61,9 @@ def _figure(form: str, value: float) -> str:
 
 def _why(verdict: "Verdict", step: float) -> str:
     """Say what decided, as far as there is more to say than the reason."""
-    from cnpgen.verdict.judge import LONGEST_STEP
-    from cnpgen.verdict.sampling import LONGEST
-    from cnpgen.verdict.verdict import Reason
+    from cnpgen.judges.plans.judge import LONGEST_STEP
+    from cnpgen.judges.plans.sampling import LONGEST
+    from cnpgen.judges.plans.verdict import Reason
 
     if verdict.reason == Reason.TOO_LONG:
         time = f"{verdict.metrics.duration:.3g} s"

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.judge import Judge
+from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.task import Task
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.judge import Judge
-from cnpgen.verdict.verdict import Verdict
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 from cnpgen.errors import UsageError, nearest
+from cnpgen.judges.plans.judge import check_step
 from cnpgen.refine import sqp
 from cnpgen.refine.criterion import OBJECTIVES
 from cnpgen.schema.arguments import integer, number
-from cnpgen.verdict.judge import check_step
 
 COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks
 SOLVERS = ("own", "ipopt", "sqpmethod")

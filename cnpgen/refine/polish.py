@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Attempt, Outcome, Refined, Task
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.verdict import Reason, Verdict
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.verdict import Reason
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.verdict.verdict import Reason
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.verdict.verdict import Margin, Verdict
+from cnpgen.judges.plans.verdict import Margin, Verdict
 
 
 def summarise(verdicts: Sequence[Verdict]) -> dict[str, Any]:

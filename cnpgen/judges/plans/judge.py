@@ -10,6 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.judges.plans.closer import keep_worse, look_closer
+from cnpgen.judges.plans.course import course, jerks
+from cnpgen.judges.plans.measure import boundary_margins, by_name, constraint_margins
+from cnpgen.judges.plans.paper import paper_rule
+from cnpgen.judges.plans.sampling import Samples, sample, time_table
+from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.obstacles import obstacle_tops
@@ -17,12 +23,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.closer import keep_worse, look_closer
-from cnpgen.verdict.course import course, jerks
-from cnpgen.verdict.margins import boundary_margins, by_name, constraint_margins
-from cnpgen.verdict.paper import paper_rule
-from cnpgen.verdict.sampling import Samples, sample, time_table
-from cnpgen.verdict.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -44,10 +44,10 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     """Judge N plans, each for itself: what one of them holds changes nothing about the others.
 
     Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
-    and at more of them near both ends (``cnpgen.verdict.sampling``). A plan is valid if it meets its boundary
+    and at more of them near both ends (``cnpgen.judges.plans.sampling``). A plan is valid if it meets its boundary
     conditions and exceeds every bound by no more than the constraint allows. Numbers that cannot be evaluated give a
     verdict that says so, no exception. What lies between two samples is not seen; only contacts, whose depth has sharp
-    peaks, are looked at more closely wherever more than is allowed could hide (``cnpgen.verdict.closer``).
+    peaks, are looked at more closely wherever more than is allowed could hide (``cnpgen.judges.plans.closer``).
 
     Args:
         problem: The problem.

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cnpgen.errors import DatasetError
+from cnpgen.judges.rows.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
+from cnpgen.judges.rows.fastest_hit import highest_speed
+from cnpgen.judges.rows.report import ENDS, Array, Check, Index, RowReport, judge, merge
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition
 from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.verify.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
-from cnpgen.verify.fastest_hit import highest_speed
-from cnpgen.verify.report import ENDS, Array, Check, Index, RowReport, judge, merge
 from cnpgen.world.state import World
 
 if TYPE_CHECKING:

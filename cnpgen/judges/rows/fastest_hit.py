@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from cnpgen.verify.report import Array
+from cnpgen.judges.rows.report import Array
 
 PARALLEL = 1e-9  # relative size of a determinant below which two terms have no vertex that could be computed
 

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.course import course
+from cnpgen.judges.plans.measure import measure_condition
+from cnpgen.judges.plans.sampling import Samples
+from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
-from cnpgen.verdict.course import course
-from cnpgen.verdict.margins import measure_condition
-from cnpgen.verdict.sampling import Samples
-from cnpgen.verdict.verdict import Margin
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:

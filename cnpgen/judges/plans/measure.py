@@ -1,18 +1,26 @@
 """How near one motion comes to every bound: of its boundary conditions and of the problem's constraints."""
 
+from typing import TYPE_CHECKING
+
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
+
+if TYPE_CHECKING:
+    from cnpgen.problems.problem import Problem
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.judges.plans.course import Course
+from cnpgen.judges.plans.sampling import Samples
+from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.verdict.course import Course
-from cnpgen.verdict.parts import name_part
-from cnpgen.verdict.sampling import Samples
-from cnpgen.verdict.verdict import NOTHING, Margin, Reason
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
@@ -127,3 +135,30 @@ def by_name(margins: list[Margin]) -> dict[str, Margin]:
         count = sum(other.name == margin.name for other in found.values())
         found[f"{margin.name} {count + 1}" if count else margin.name] = margin
     return found
+
+
+_PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointTorque
+
+
+def name_part(problem: "Problem", constraint: Constraint, condition: Condition, part: int) -> str:
+    """Name one of a condition's values; the only one has no name, those of plug-ins are numbered.
+
+    Args:
+        problem: The problem.
+        constraint: The constraint that the condition belongs to.
+        condition: The condition.
+        part: Index of the value.
+    """
+    if len(condition.g) == 1:
+        return ""
+    if isinstance(constraint, _PER_JOINT):
+        return problem.robot.joints[part]
+    if isinstance(constraint, Table | Vertical):
+        return "xy"[part]
+    obstacles = [obstacle.name for obstacle in problem.obstacle]
+    if isinstance(constraint, ObjectContact):
+        return obstacles[part]
+    if isinstance(constraint, RobotClearance):  # segment by segment
+        segment, obstacle = divmod(part, len(obstacles))
+        return f"segment {segment + 1}, {obstacles[obstacle]}"
+    return f"[{part}]"

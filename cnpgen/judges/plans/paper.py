@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.verdict import PaperRule
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
-from cnpgen.verdict.verdict import PaperRule
 
 if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem

@@ -102,7 +102,7 @@ class Metrics:
 
 @dataclass(frozen=True)
 class PaperRule:
-    """The looser rules by which the paper counts (``cnpgen.verdict.paper``).
+    """The looser rules by which the paper counts (``cnpgen.judges.plans.paper``).
 
     Attributes:
         finished: Whether the tip ends at the goal.

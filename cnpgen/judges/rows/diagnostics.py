@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cnpgen.judges.rows.report import ENDS, Array, Check, Index, judge
 from cnpgen.problems.constraints.clearance import RobotClearance
-from cnpgen.verify.report import ENDS, Array, Check, Index, judge
 from cnpgen.world.state import World
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Rows of datasets recomputed with Pinocchio and Coal."""
