@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
     from cnpgen.losses.metric import Metric
+    from cnpgen.losses.metric_settings import suggested_weights
     from cnpgen.losses.plan_loss import PlanLoss
     from cnpgen.losses.quadrature import rotating_shift
-    from cnpgen.losses.schedule import suggested_weights
     from cnpgen.make import make_dataset
     from cnpgen.pipelines.load import load_pipeline
     from cnpgen.planner.model_file import load_model
@@ -85,7 +85,7 @@ _HOME = {
     "rotating_shift": "losses.quadrature",
     "save_plans": "plans.save",
     "states_at": "planner.planner",
-    "suggested_weights": "losses.schedule",
+    "suggested_weights": "losses.metric_settings",
     "train_model": "training.train",
     "validate_dataset": "validation",
 }

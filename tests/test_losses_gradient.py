@@ -8,8 +8,7 @@ import pytest
 from example_losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
 from example_plans import PROBLEMS
 
-from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.losses.value import LossValue
+from cnpgen.losses.plan_loss import LossValue, PlanLoss
 from cnpgen.schema.keys import Range
 
 CASES = [(label, term, "signed") for label in ("hit", "transport") for term in loss(PROBLEM_OF[label]).terms]

@@ -9,7 +9,7 @@ from example_losses import loss
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric import Metric, alpha_step, average_loss
-from cnpgen.losses.schedule import BOUNDED, PUBLISHED, MetricSettings, suggested_weights
+from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings, suggested_weights
 
 E = math.e
 

@@ -14,8 +14,8 @@ from test_symbolic import HIGH, LOW, box_bounds, coal_segment_separation, segmen
 
 from cnpgen.kernels.interpreted import InterpretedGridKernel
 from cnpgen.kernels.tape import Grid, tape_from_function
+from cnpgen.losses.integrand import HeldState
 from cnpgen.losses.published import published
-from cnpgen.losses.stage import HeldState
 from cnpgen.losses.terms import constraint_term
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.symbolic.boxes import signed_segment_box_distance

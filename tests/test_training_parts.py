@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.losses.margins import suggested_margins
 from cnpgen.losses.metric import Metric
-from cnpgen.losses.schedule import MetricSettings
+from cnpgen.losses.metric_settings import MetricSettings
 from cnpgen.network.architecture import Architecture
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.margins import suggested_margins
 from cnpgen.training.prepare import begin_run
 from cnpgen.training.schedule import learning_rate
 from cnpgen.training.settings import METRICS, Length, TrainingSettings

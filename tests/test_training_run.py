@@ -17,7 +17,7 @@ from conftest import tiny_recipe
 from example_models import SMALL
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.losses.schedule import BOUNDED
+from cnpgen.losses.metric_settings import BOUNDED
 from cnpgen.make import make_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model

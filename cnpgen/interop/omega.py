@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
-from cnpgen.losses.plan_batch import real_array
 from cnpgen.network import omega
 from cnpgen.network.omega import ControlPoints
 from cnpgen.network.tasks import Tasks
@@ -26,7 +25,7 @@ from cnpgen.problems.load import problem_of
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem, problem_identity
 from cnpgen.problems.robot import load_robot
-from cnpgen.schema.arguments import integer, number
+from cnpgen.schema.arguments import integer, number, real_array
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

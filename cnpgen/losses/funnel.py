@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.stage import has_funnel, stated
+from cnpgen.losses.integrand import has_funnel, stated
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import SymbolicState

@@ -1,5 +1,6 @@
 """How much tighter than the problem's the bounds are while training, so that what is learned has room to spare."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -49,3 +50,22 @@ class Margins:
         for name, inset in self.insets.items():
             if not np.isfinite(inset):
                 yield f"margin of {name!r}: an inset must be a finite number, got {inset}"
+
+
+# A penalty leaves violations of the order of 1 / weight, and a network errs by a percent here and there.
+FACTORS = {"joint-position": 0.999, "joint-velocity": 0.99, "joint-acceleration": 0.985, "joint-torque": 0.97}
+INSETS = {"table": 1e-3, "object-contact": 5e-4}  # m
+
+
+def suggested_margins(terms: Sequence[str]) -> Margins:
+    """Return the margins of the terms whose kinds are known; none of others.
+
+    Args:
+        terms: ``PlanLoss.terms``; the second of a kind is called ``kind-2``.
+    """
+    return Margins(_known(terms, FACTORS), _known(terms, INSETS))
+
+
+def _known(terms: Sequence[str], by_kind: Mapping[str, float]) -> dict[str, float]:
+    kinds = {name: re.sub(r"-\d+$", "", name) for name in terms}
+    return {name: by_kind[kind] for name, kind in kinds.items() if kind in by_kind}

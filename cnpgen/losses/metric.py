@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.schedule import Average, MetricSettings
+from cnpgen.losses.metric_settings import Average, MetricSettings
 
 Array = NDArray[np.float64]
 TRIMMED = 0.1  # fraction of the plans, those with the largest losses, that a trimmed mean leaves out

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
+from cnpgen.schema.arguments import real_array
 
 Array = NDArray[Any]
 BLOCK = 128  # plans at a time: their points stay in the cache
@@ -109,21 +110,3 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
         if name in shapes and shapes[name] != (count, *tail):
             expected = ", ".join(str(size) for size in ("N" if name == "path" else count, *tail))
             raise UsageError(f"{name} must have shape ({expected}), got {shapes[name]}")
-
-
-def real_array(name: str, values: ArrayLike, dtype: str) -> Array:
-    """Cast to an array of floats.
-
-    Raises:
-        UsageError: These are no real numbers, or not in the memory of this process.
-    """
-    wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
-    try:
-        array = np.asarray(values)
-        with np.errstate(over="ignore"):
-            real: Array = array.real.astype(dtype, copy=False)
-    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
-        raise UsageError(f"{wrong}: {error}") from error
-    if array.dtype.kind in "cUSmM":  # NumPy would drop an imaginary part, and read texts
-        raise UsageError(f"{wrong}: {array.dtype} is no real type")
-    return real

@@ -1,6 +1,7 @@
 """The loss of plans with its gradient: integrals of the step losses over the phase."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,20 +14,39 @@ from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
 from cnpgen.kernels.tape import DTYPES, Dtype
 from cnpgen.losses.funnel import Funnel, make_funnel
+from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
 from cnpgen.losses.margins import Margins
-from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes, real_array
+from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import Table, basis_table, check_quadrature
-from cnpgen.losses.stage import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
-from cnpgen.losses.value import LossValue
 from cnpgen.problems.load import problem_of
 from cnpgen.problems.problem import Problem, problem_identity
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
-from cnpgen.schema.arguments import flag, number
+from cnpgen.schema.arguments import flag, number, real_array
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
 _BUILT = {"_gradient", "_values", "_funnel"}
+
+
+@dataclass(frozen=True)
+class LossValue:
+    """What N plans cost. A plan that is none costs nan, and no other is touched.
+
+    A plan is none if a control point is not finite, or a control point of the rate not positive: r(s) lies between the
+    least and the largest of them, so that positive ones are enough, though not needed, for a motion that runs forward.
+
+    Attributes:
+        total: Task loss plus the weighted constraint terms, shape (N,).
+        terms: The integrals without weights, the task loss first, shape (N, 1 + m).
+        path_gradient: Gradient of every plan's total with respect to its path control points, shape (N, C, n).
+        rate_gradient: Likewise with respect to its rate control points, shape (N, R).
+    """
+
+    total: Array
+    terms: Array
+    path_gradient: Array
+    rate_gradient: Array
 
 
 class PlanLoss:

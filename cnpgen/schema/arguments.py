@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 
+Array = NDArray[Any]
+
 
 def integer(name: str, value: Any, *, least: int, most: int | None = None) -> int:
     """Return an argument as an integer; NumPy's integers are some, True is none.
@@ -69,3 +71,21 @@ def flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise UsageError(f"{name} must be True or False, got {value!r:.100}")
     return bool(value)
+
+
+def real_array(name: str, values: ArrayLike, dtype: str) -> Array:
+    """Cast to an array of floats.
+
+    Raises:
+        UsageError: These are no real numbers, or not in the memory of this process.
+    """
+    wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
+    try:
+        array = np.asarray(values)
+        with np.errstate(over="ignore"):
+            real: Array = array.real.astype(dtype, copy=False)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
+        raise UsageError(f"{wrong}: {error}") from error
+    if array.dtype.kind in "cUSmM":  # NumPy would drop an imaginary part, and read texts
+        raise UsageError(f"{wrong}: {array.dtype} is no real type")
+    return real

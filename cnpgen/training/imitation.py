@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.losses.value import LossValue
+from cnpgen.losses.plan_loss import LossValue
 from cnpgen.network.omega import ControlPoints
 
 Array = NDArray[Any]

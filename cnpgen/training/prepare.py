@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import UsageError
+from cnpgen.losses.margins import suggested_margins
 from cnpgen.losses.metric import Metric
+from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.losses.schedule import suggested_weights
 from cnpgen.machine.versions import __version__
 from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.store.files.documents import plain
-from cnpgen.training.margins import suggested_margins
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.run import Run
 from cnpgen.training.settings import Length, TrainingSettings

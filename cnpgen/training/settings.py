@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.schedule import BOUNDED, PUBLISHED, MetricSettings
+from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
 from cnpgen.schema.arguments import integer, number
 
 METRICS = {

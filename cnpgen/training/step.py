@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.losses.value import LossValue
+from cnpgen.losses.plan_loss import LossValue
 from cnpgen.network.architecture import Architecture
 from cnpgen.network.forward import backward, forward
 from cnpgen.network.omega import ControlPoints, control_points, pull_back

@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.host import evaluate
-from cnpgen.losses.plan_batch import real_array
 from cnpgen.losses.quadrature import check_quadrature
 from cnpgen.network.tasks import Tasks
-from cnpgen.schema.arguments import number
+from cnpgen.schema.arguments import number, real_array
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:

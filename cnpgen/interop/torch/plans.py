@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.host import evaluate
-from cnpgen.losses.plan_batch import real_array
+from cnpgen.schema.arguments import real_array
 
 if TYPE_CHECKING:
     from cnpgen.interop.omega import Omega
