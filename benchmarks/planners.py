@@ -17,11 +17,11 @@ import numpy as np
 from common import arguments, median, progress, report, table, verdict
 from refiner_problems import grid_of_hits, make_each
 
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.refine.options import DEFAULT
 from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems

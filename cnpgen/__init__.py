@@ -11,8 +11,6 @@ from cnpgen.machine.versions import __version__
 if TYPE_CHECKING:
     from cnpgen.doctor import check_machine
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
-    from cnpgen.evaluation import Evaluation, evaluate_plans
-    from cnpgen.export.plans import export_plans
     from cnpgen.interop.omega import Omega
     from cnpgen.library import load_dataset_recipe
     from cnpgen.loader.load import load_dataset
@@ -25,6 +23,8 @@ if TYPE_CHECKING:
     from cnpgen.pipelines.load import load_pipeline
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner, states_at
+    from cnpgen.plans.evaluate import Evaluation, evaluate_plans
+    from cnpgen.plans.export import export_plans
     from cnpgen.plans.load import load_plans
     from cnpgen.plans.plans import Plans, make_plans
     from cnpgen.plans.save import save_plans
@@ -48,7 +48,7 @@ _HOME = {
     "Boundary": "trajectory.boundary",
     "CnpgenError": "errors",
     "DatasetError": "errors",
-    "Evaluation": "evaluation",
+    "Evaluation": "plans.evaluate",
     "MachineError": "errors",
     "Margins": "losses.margins",
     "Metric": "losses.metric",
@@ -64,9 +64,9 @@ _HOME = {
     "UsageError": "errors",
     "check_machine": "doctor",
     "draw_problems": "solving",
-    "evaluate_plans": "evaluation",
+    "evaluate_plans": "plans.evaluate",
     "explain_plans": "refine.proof",
-    "export_plans": "export.plans",
+    "export_plans": "plans.export",
     "fit_motion": "trajectory.fit",
     "inspect_dataset": "store.inspection",
     "list_recipes": "schema.catalogue",

@@ -13,10 +13,10 @@ import pytest
 from cnpgen.certification import NO_PLAN, CertifiedPlan, PlanCheck, certified, check_plans
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.library import load_dataset_recipe
 from cnpgen.make import make_dataset
 from cnpgen.plans import load_plans, save_plans
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine import polish

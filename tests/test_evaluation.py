@@ -11,11 +11,11 @@ import pytest
 from example_plans import bent, joined, load
 from plan_files import garbage, plans_of
 
-import cnpgen.evaluation
+import cnpgen.plans.evaluate
 from cnpgen.errors import UsageError
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.judges.plans import Verdict, judge
 from cnpgen.plans import PlanStatus, load_plans, save_plans
+from cnpgen.plans.evaluate import evaluate_plans
 
 
 def told(verdicts: Iterable[Verdict]) -> list[dict[str, Any]]:
@@ -46,7 +46,7 @@ def test_garbage_gets_an_honest_verdict_and_a_status_and_changes_nothing_beside_
 
 
 def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cnpgen.evaluation, "PART", 3)
+    monkeypatch.setattr(cnpgen.plans.evaluate, "PART", 3)
     plans = plans_of(*(plan for plan, _ in garbage().values()))
     counts: list[int] = []
     one, two = (evaluate_plans(plans, workers=workers, progress=counts.append) for workers in (1, 2))

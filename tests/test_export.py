@@ -13,8 +13,9 @@ import pytest
 from test_plans import AIRHOCKEY, draw_plans, garbage
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.export import FORMS, Exported, export_plans, sample_plan
 from cnpgen.plans import Plans
+from cnpgen.plans.export import FORMS, Exported, export_plans
+from cnpgen.plans.formats import sample_plan
 from cnpgen.trajectory.motion import Motion
 
 FIELDS = ("q", "dq", "ddq", "jerk")

@@ -14,8 +14,8 @@ from test_plans import draw_plans
 
 from cnpgen.cli.export_command import FORMS
 from cnpgen.cli.main import main
-from cnpgen.export import FORMS as LIBRARY_FORMS
 from cnpgen.plans import PlanStatus, save_plans
+from cnpgen.plans.export import FORMS as LIBRARY_FORMS
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -12,7 +12,7 @@ from example_plans import Plan, bent, course, load
 from matplotlib.figure import Figure
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.plan_plots import plot_plan
+from cnpgen.plans.plot import plot_plan
 
 
 def draw(plan: Plan, path: Path, index: int = 0) -> None:

@@ -9,8 +9,8 @@ from conftest import columns_of
 from example_models import boundary_of_columns, untrained_model
 
 from cnpgen.errors import UsageError
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.planner.planner import Planner, states_at
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.trajectory.boundary import Boundary
 

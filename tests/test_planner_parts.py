@@ -10,9 +10,9 @@ from example_models import boundary_of_columns, surroundings_of, untrained_model
 from example_plans import KNOTS
 from scipy.interpolate import BSpline
 
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.planner.kit import make_kit
 from cnpgen.planner.slowing import PHASES, SLOWEST, make_slowing
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import anchor_line, assemble

@@ -19,8 +19,6 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
-from cnpgen.evaluation import evaluate_plans
-from cnpgen.export import export_plans
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.plans import (
     Plans,
@@ -33,6 +31,8 @@ from cnpgen.plans import (
     save_plans,
     screen,
 )
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.export import export_plans
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.robot import load_robot

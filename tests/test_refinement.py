@@ -15,9 +15,9 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.make import make_dataset
 from cnpgen.plans import PlanStatus, load_plans, save_plans
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 from conftest import SHIPPED
 
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.library import load_dataset_recipe
 from cnpgen.planner.model_file import load_model, shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
 
 LARGEST = 3_000_000  # bytes

@@ -7,8 +7,8 @@ from typing import Any
 from example_plans import load
 from plan_files import plans_of
 
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.judges.plans import Reason
+from cnpgen.plans.evaluate import evaluate_plans
 
 PAGE = (Path(__file__).parents[1] / "docs" / "verdict.md").read_text(encoding="utf-8")
 

@@ -12,8 +12,8 @@ from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
-    from cnpgen.evaluation import Evaluation
     from cnpgen.judges.plans import Verdict
+    from cnpgen.plans.evaluate import Evaluation
 
 _TEXT = """\
 Every plan is looked at on a fine time grid and judged for itself; docs/verdict.md says by what. The exit code is 0 if
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.errors import UsageError
-    from cnpgen.evaluation import evaluate_plans
+    from cnpgen.plans.evaluate import evaluate_plans
 
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
@@ -94,8 +94,8 @@ def _write_json(file: Path, found: "Evaluation") -> None:
 
 
 def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
-    from cnpgen.plan_plots import plot_plan
     from cnpgen.plans import open_problem
+    from cnpgen.plans.plot import plot_plan
     from cnpgen.problems.obstacles import obstacle_tops
 
     plans, chosen = found.plans, _chosen(found) if index is None else index

@@ -10,10 +10,10 @@ from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import read_plans
 
 if TYPE_CHECKING:
-    from cnpgen.export import Exported
     from cnpgen.plans import Plans
+    from cnpgen.plans.export import Exported
 
-FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.export, which takes a while to import
+FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.plans.export, which takes a while to import
 NAMED = 10  # plans that are not valid, by number
 
 _TEXT = """\
@@ -44,7 +44,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.export import export_plans
+    from cnpgen.plans.export import export_plans
 
     plans = read_plans(arguments.file)
     chosen, out = _chosen(plans, arguments), _place(arguments)

@@ -8,8 +8,8 @@ from cnpgen.describe import table
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
-    from cnpgen.evaluation import Evaluation
     from cnpgen.judges.plans import Verdict
+    from cnpgen.plans.evaluate import Evaluation
 
 METRICS = {  # metric -> what it is called, in a summary and in a list, and its format
     "duration_s": ("motion time [s]", "T [s]", "{:.4f}"),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
-from cnpgen.plans.layout import BOUNDARY
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.store.files.documents import canonical_sha256

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, counted, nearest
-from cnpgen.plans.layout import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
+from cnpgen.plans.format import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.load import load_problem

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
-from cnpgen.plans.layout import FLOATS, INTEGERS, NOTES
+from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, record_problem

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.layout import BOUNDARY, FORMAT, FORMAT_VERSION, NOTES, plan_fields
+from cnpgen.plans.format import BOUNDARY, FORMAT, FORMAT_VERSION, NOTES, plan_fields
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files.atomic import write_file

@@ -10,7 +10,7 @@ from cnpgen.network.features import Features, fit_features
 from cnpgen.network.omega import ControlPoints
 from cnpgen.network.tasks import Tasks
 from cnpgen.planner.preparation import Preparation
-from cnpgen.plans.layout import BOUNDARY
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[Any]

@@ -8,7 +8,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.network.omega import ControlPoints
-from cnpgen.plans.layout import BOUNDARY
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.training.rows import boundary_columns
 from cnpgen.trajectory.boundary import Boundary

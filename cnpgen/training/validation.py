@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.evaluation import evaluate_plans
 from cnpgen.planner.kit import Kit
 from cnpgen.planner.model import Model
+from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.trajectory.boundary import Boundary
 
 MEANS = ("duration_s", "z_error_mm_s", "vertical_error_rad_s")

@@ -8,10 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.export.csv_table import csv_table
-from cnpgen.export.joint_trajectory import joint_trajectory
-from cnpgen.export.npz import write_npz
-from cnpgen.export.sampled import Sampled, sample_plan
+from cnpgen.plans.formats import Sampled, csv_table, joint_trajectory, sample_plan, write_npz
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files.atomic import write_file
