@@ -23,7 +23,7 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.refine.options import DEFAULT
-from cnpgen.refinement import refine_plans
+from cnpgen.refine.plans import refine_plans
 from cnpgen.solving import draw_problems
 
 PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000, "heavy-object": 300}

@@ -19,9 +19,9 @@ from cnpgen.refine.engine import prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
+from cnpgen.refine.proof.tip_bound import Arm
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Refined, Task
-from cnpgen.refine.tip_bound import Arm
 from cnpgen.solving import problems_of_rows
 from cnpgen.trajectory.boundary import assemble
 from cnpgen.trajectory.motion import Motion

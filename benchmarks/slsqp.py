@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.bounds import Bounds
 from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.transcription import Evaluation, Transcription
 from cnpgen.refine.task import Task
-from cnpgen.refine.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 MAX_ITERATIONS = 200

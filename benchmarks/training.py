@@ -27,7 +27,7 @@ from cnpgen.make import make_dataset
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import problem_of, read_rows
-from cnpgen.refinement import refine_plans
+from cnpgen.refine.plans import refine_plans
 from cnpgen.training import step as parts
 from cnpgen.training.prepare import begin_run, prepare_run
 from cnpgen.training.settings import Length, TrainingSettings

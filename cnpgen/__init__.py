@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from cnpgen.problems.load import load_problem
     from cnpgen.problems.obstacles import obstacle_tops
     from cnpgen.refine.options import RefineOptions
-    from cnpgen.refine.proof import explain_plans
-    from cnpgen.refinement import Refinement, refine_plans
+    from cnpgen.refine.plans import Refinement, refine_plans
+    from cnpgen.refine.proof.proof import explain_plans
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.inspection import inspect_dataset
@@ -59,13 +59,13 @@ _HOME = {
     "Plans": "plans.plans",
     "RecipeError": "errors",
     "RefineOptions": "refine.options",
-    "Refinement": "refinement",
+    "Refinement": "refine.plans",
     "TrainingSettings": "training.settings",
     "UsageError": "errors",
     "check_machine": "doctor",
     "draw_problems": "solving",
     "evaluate_plans": "plans.evaluate",
-    "explain_plans": "refine.proof",
+    "explain_plans": "refine.proof.proof",
     "export_plans": "plans.export",
     "fit_motion": "trajectory.fit",
     "inspect_dataset": "store.inspection",
@@ -81,7 +81,7 @@ _HOME = {
     "make_plans": "plans.plans",
     "obstacle_tops": "problems.obstacles",
     "open_dataset": "store.reader",
-    "refine_plans": "refinement",
+    "refine_plans": "refine.plans",
     "rotating_shift": "losses.quadrature",
     "save_plans": "plans.save",
     "states_at": "planner.planner",

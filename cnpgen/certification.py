@@ -67,10 +67,10 @@ class CertifiedPlan(Stage):
         """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
-        from cnpgen.refine.criterion import choose_criterion
         from cnpgen.refine.jury import Jury
         from cnpgen.refine.polish import refine_task
         from cnpgen.refine.refiner import Refiner
+        from cnpgen.refine.solver.criterion import choose_criterion
         from cnpgen.refine.task import Task
         from cnpgen.world.state import World
 

@@ -10,10 +10,10 @@ from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.criterion import Criterion
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.criterion import Criterion
 from cnpgen.refine.task import Refined, Task
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

@@ -20,8 +20,8 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine import polish
+from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Refined
-from cnpgen.refinement import refine_plans
 from cnpgen.solving import load_problems, problems_of_rows
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset

@@ -26,7 +26,7 @@ def test_what_is_said_for_every_kernel_is_printed_once_per_command(
             logging.getLogger(name).info("building it")
         raise UsageError("enough")
 
-    monkeypatch.setattr("cnpgen.refinement.refine_plans", refine)
+    monkeypatch.setattr("cnpgen.refine.plans.refine_plans", refine)
     save_plans(tmp_path / "plans.h5", plans_of(load("hit")))
     assert main(["refine", str(tmp_path / "plans.h5"), *options]) == 2
     assert capsys.readouterr().err.splitlines() == [*lines, "cnpgen: error: enough"]

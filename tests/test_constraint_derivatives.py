@@ -10,7 +10,7 @@ import pytest
 from test_constraints import HEAVY, KINDS, Bench, gantry_problem, measured_forms, values
 
 from cnpgen.problems.load import load_problem
-from cnpgen.refine.stage import stage_jacobian, stage_values
+from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 
 STEP = 1e-6
 PAIRS = [

@@ -36,7 +36,7 @@ from cnpgen.plans.export import export_plans
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.robot import load_robot
-from cnpgen.refinement import refine_plans
+from cnpgen.refine.plans import refine_plans
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 
 DOCS = Path(__file__).parents[1] / "docs" / "plan-format.md"

@@ -13,19 +13,19 @@ from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Verdict
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.refine import sqp
-from cnpgen.refine.bounds import Bounds
-from cnpgen.refine.criterion import Criterion, choose_criterion, criterion_residuals
-from cnpgen.refine.grid import make_grid
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
-from cnpgen.refine.quadratic import Model, choose
 from cnpgen.refine.refiner import Pass, Refiner
-from cnpgen.refine.sqp import Settings, minimise
-from cnpgen.refine.stage import stage_jacobian, stage_values
+from cnpgen.refine.solver import sqp
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.criterion import Criterion, choose_criterion, criterion_residuals
+from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.quadratic import Model, choose
+from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.sqp import Settings, minimise
+from cnpgen.refine.solver.transcription import Stage, Transcription
 from cnpgen.refine.task import Outcome, Refined
-from cnpgen.refine.transcription import Stage, Transcription
 from cnpgen.symbolic.state import SymbolicState
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

@@ -11,12 +11,12 @@ from example_plans import load
 from example_refiner import refiner, task
 from test_refine import transcription
 
-from cnpgen.refine.alternatives import minimise_with
-from cnpgen.refine.callbacks import Callbacks
-from cnpgen.refine.criterion import Criterion
-from cnpgen.refine.hessian import lagrangian_hessian
-from cnpgen.refine.programme import Programme
-from cnpgen.refine.sqp import Bounds, Settings
+from cnpgen.refine.casadi.alternatives import minimise_with
+from cnpgen.refine.casadi.callbacks import Callbacks
+from cnpgen.refine.casadi.programme import Programme
+from cnpgen.refine.solver.criterion import Criterion
+from cnpgen.refine.solver.hessian import lagrangian_hessian
+from cnpgen.refine.solver.sqp import Bounds, Settings
 
 SOLVERS = ("ipopt", "sqpmethod")
 

@@ -15,12 +15,12 @@ from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
-from cnpgen.refine import table_proof
-from cnpgen.refine.proof import Finding, Kind, explain_failure, explain_plans
-from cnpgen.refine.reachable import Departure, JointLimits, departures, joint_limits, moments
-from cnpgen.refine.table_proof import table_bounds
-from cnpgen.refine.tip_bound import Arm, bound_projection
-from cnpgen.refinement import refine_plans
+from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.proof import table_proof
+from cnpgen.refine.proof.proof import Finding, Kind, explain_failure, explain_plans
+from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, joint_limits, moments
+from cnpgen.refine.proof.table_proof import table_bounds
+from cnpgen.refine.proof.tip_bound import Arm, bound_projection
 from cnpgen.solving import draw_problems
 from cnpgen.trajectory.boundary import Boundary
 

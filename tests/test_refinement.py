@@ -21,8 +21,8 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions
+from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Outcome
-from cnpgen.refinement import refine_plans
 from cnpgen.solving import draw_problems, load_problems
 
 N = 13
@@ -151,7 +151,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
     with pytest.raises(UsageError, match=r"another run \(options\.weight None, now 2\.0, other plans\): --force"):
         refine_plans(solved, workers=1, journal=journal, options=RefineOptions(weight=2.0))
     with monkeypatch.context() as patch:
-        patch.setattr("cnpgen.refinement.__version__", "99.0")
+        patch.setattr("cnpgen.refine.plans.__version__", "99.0")
         with pytest.raises(UsageError, match=r"another run \(version .*, now 99\.0\): --force"):
             refine_plans(problems, workers=1, journal=journal)
 
@@ -248,7 +248,7 @@ def test_ctrl_c_while_problems_are_explained_loses_nothing(
     save_plans(tmp_path / "hard.h5", replace(problem, boundary=fast))
     command = ["refine", str(tmp_path / "hard.h5"), "-o", str(out), "--explain"]
     with monkeypatch.context() as patch:
-        patch.setattr("cnpgen.refine.proof.explain_failure", stop)
+        patch.setattr("cnpgen.refine.proof.proof.explain_failure", stop)
         assert main(command) == 130
     assert "run the same command again" in capsys.readouterr().err
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["hard.h5", "out.h5.part"]

@@ -15,7 +15,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import MachineError
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.refinement import refine_plans
+from cnpgen.refine.plans import refine_plans
 from cnpgen.solving import draw_problems
 
 N = 14

@@ -14,7 +14,7 @@ from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
-    from cnpgen.refinement import Refinement
+    from cnpgen.refine.plans import Refinement
 
 REFINING = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")  # what add_refining adds
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
@@ -75,7 +75,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
-    from cnpgen.refinement import refine_plans
+    from cnpgen.refine.plans import refine_plans
 
     given = {name: getattr(arguments, name) for name in REFINING}
     options = RefineOptions(**{name: value for name, value in given.items() if value is not None})
@@ -134,7 +134,7 @@ def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, secon
 
 def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
     """Add to the facts about plans that are not valid what is proven about their problems."""
-    from cnpgen.refine.proof import explain_plans
+    from cnpgen.refine.proof.proof import explain_plans
 
     if facts["not_valid"]:
         meter.begin("explaining", len(facts["not_valid"]))
@@ -146,7 +146,7 @@ def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
 
 def _summary(facts: dict[str, Any], seconds: float, *, listed: int) -> list[str]:
     """Say in a few lines what came of the plans."""
-    from cnpgen.refinement import outcome_text
+    from cnpgen.refine.plans import outcome_text
 
     mean = facts["mean_duration_s"]
     lines = [

@@ -11,12 +11,12 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import ProblemRecord, open_problem
-from cnpgen.refine.criterion import choose_criterion
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Passes, Refiner
-from cnpgen.refine.sqp import Settings
+from cnpgen.refine.solver.criterion import choose_criterion
+from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.task import Refined, Task
 from cnpgen.trajectory.spec import TrajectorySpec
 

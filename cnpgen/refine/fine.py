@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.bounds import BoundsTemplate, Tightening
-from cnpgen.refine.grid import make_grid
+from cnpgen.refine.solver.bounds import BoundsTemplate, Tightening
+from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.transcription import Stage, Transcription, of_last
 from cnpgen.refine.task import Task
-from cnpgen.refine.transcription import Stage, Transcription, of_last
 
 if TYPE_CHECKING:
     from cnpgen.world.state import World

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.judges.plans.judge import check_step
-from cnpgen.refine import sqp
-from cnpgen.refine.criterion import OBJECTIVES
+from cnpgen.refine.solver import sqp
+from cnpgen.refine.solver.criterion import OBJECTIVES
 from cnpgen.schema.arguments import integer, number
 
 COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks

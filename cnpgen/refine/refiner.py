@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.problem import Problem
-from cnpgen.refine import starts
-from cnpgen.refine.alternatives import minimise_with
-from cnpgen.refine.bounds import Bounds, BoundsTemplate, Tightening
-from cnpgen.refine.criterion import Criterion, criterion_residuals
+from cnpgen.refine.casadi.alternatives import minimise_with
 from cnpgen.refine.fine import FineCheck
-from cnpgen.refine.grid import make_grid
-from cnpgen.refine.sqp import DEFAULT, Result, Settings, minimise
-from cnpgen.refine.stage import stage_jacobian, stage_values
+from cnpgen.refine.solver import starts
+from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate, Tightening
+from cnpgen.refine.solver.criterion import Criterion, criterion_residuals
+from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.sqp import DEFAULT, Result, Settings, minimise
+from cnpgen.refine.solver.transcription import Stage, Transcription
 from cnpgen.refine.task import Attempt, Outcome, Task
-from cnpgen.refine.transcription import Stage, Transcription
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """How far the tip must leave a table soon after the start, or shortly before the goal.
 
-At a time t from an end every joint is somewhere in its interval (``cnpgen.refine.reachable``). The smallest
+At a time t from an end every joint is somewhere in its interval (``cnpgen.refine.proof.reachable``). The smallest
 exceedance of the table's rectangle over that box, with the tip at the table's height, is found by sequential linear
 programming; the multipliers at its end give a combination of the table's bounds that ``bound_projection`` proves to be
 exceeded in the whole box.
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.reachable import Departure, JointLimits, departures, joint_limits, moments
-from cnpgen.refine.tip_bound import Arm, bound_projection
+from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, joint_limits, moments
+from cnpgen.refine.proof.tip_bound import Arm, bound_projection
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 

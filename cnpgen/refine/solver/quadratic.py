@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.bounds import Bounds
-from cnpgen.refine.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

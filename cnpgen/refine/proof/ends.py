@@ -9,7 +9,7 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.reachable import joint_limits
+from cnpgen.refine.proof.reachable import joint_limits
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.state import World

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.bounds import Bounds
-from cnpgen.refine.callbacks import Callbacks
-from cnpgen.refine.hessian import lagrangian_hessian
-from cnpgen.refine.transcription import Evaluation, Transcription
+from cnpgen.refine.casadi.callbacks import Callbacks
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.hessian import lagrangian_hessian
+from cnpgen.refine.solver.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.refine.ends import end_mistakes
-from cnpgen.refine.reachable import departures, joint_limits, moments
-from cnpgen.refine.table_proof import find_leaving
+from cnpgen.refine.proof.ends import end_mistakes
+from cnpgen.refine.proof.reachable import departures, joint_limits, moments
+from cnpgen.refine.proof.table_proof import find_leaving
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.bounds import Bounds
-from cnpgen.refine.quadratic import Mask, Model, Step, choose, crests
-from cnpgen.refine.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.quadratic import Mask, Model, Step, choose, crests
+from cnpgen.refine.solver.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii

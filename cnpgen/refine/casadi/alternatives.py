@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.machine.signals import Received, signals_held_back
-from cnpgen.refine.bounds import Bounds
-from cnpgen.refine.programme import Programme
-from cnpgen.refine.sqp import Result, Settings
-from cnpgen.refine.transcription import Transcription
+from cnpgen.refine.casadi.programme import Programme
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.sqp import Result, Settings
+from cnpgen.refine.solver.transcription import Transcription
 
 Array = NDArray[np.float64]
 PATIENCE = 6  # these solvers take smaller steps: they may take this many times as many

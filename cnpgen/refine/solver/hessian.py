@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.transcription import Evaluation, Transcription
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

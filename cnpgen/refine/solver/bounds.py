@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.stage import residual_scale
+from cnpgen.refine.solver.residuals import residual_scale
 
 if TYPE_CHECKING:
     from cnpgen.world.state import World

@@ -2,7 +2,7 @@
 
 Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
 by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix
-A). Residuals are the problem's constraints, each divided by a natural size (``cnpgen.refine.stage``), so that a
+A). Residuals are the problem's constraints, each divided by a natural size (``cnpgen.refine.solver.residuals``), so that a
 violation of 1e-3 means about the same everywhere.
 """
 
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.refine.criterion import Criterion
-from cnpgen.refine.grid import Bases, Grid
+from cnpgen.refine.solver.criterion import Criterion
+from cnpgen.refine.solver.grid import Bases, Grid
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.slopes import boundary_slopes
 from cnpgen.trajectory.spec import TrajectorySpec
@@ -56,10 +56,10 @@ class Stage:
 
     Attributes:
         spec: Degree and numbers of control points.
-        values: Kernel of ``cnpgen.refine.stage.stage_values``.
-        jacobian: Kernel of ``cnpgen.refine.stage.stage_jacobian``.
+        values: Kernel of ``cnpgen.refine.solver.residuals.stage_values``.
+        jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
         criterion: What is minimised beside the time, or None.
-        residuals: Kernel of ``cnpgen.refine.criterion.criterion_residuals``, or None.
+        residuals: Kernel of ``cnpgen.refine.solver.criterion.criterion_residuals``, or None.
     """
 
     spec: TrajectorySpec

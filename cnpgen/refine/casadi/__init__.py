@@ -1,0 +1,1 @@
+"""The same programme for CasADi's solvers, to compare with."""

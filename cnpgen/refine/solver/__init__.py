@@ -1,0 +1,1 @@
+"""Sequential quadratic programming over the transcribed problem."""
