@@ -11,7 +11,6 @@ from cnpgen.machine.versions import __version__
 if TYPE_CHECKING:
     from cnpgen.doctor import check_machine
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
-    from cnpgen.interop.omega import Omega
     from cnpgen.library import load_dataset_recipe
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from cnpgen.make import make_dataset
     from cnpgen.pipelines.load import load_pipeline
     from cnpgen.planner.model_file import load_model
+    from cnpgen.planner.omega import Omega
     from cnpgen.planner.planner import Planner, states_at
     from cnpgen.plans.evaluate import Evaluation, evaluate_plans
     from cnpgen.plans.export import export_plans
@@ -53,7 +53,7 @@ _HOME = {
     "Margins": "losses.margins",
     "Metric": "losses.metric",
     "Motion": "trajectory.motion",
-    "Omega": "interop.omega",
+    "Omega": "planner.omega",
     "PlanLoss": "losses.plan_loss",
     "Planner": "planner.planner",
     "Plans": "plans.plans",

@@ -8,10 +8,10 @@ import numpy as np
 
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.kit import Surroundings, make_kit
 from cnpgen.planner.landing import make_landing
 from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.training.rows import Rows, prepare_rows, resting

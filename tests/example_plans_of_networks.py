@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import BSpline
 
-from cnpgen.interop.omega import Omega
+from cnpgen.planner.omega import Omega
 from cnpgen.problems.load import load_problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import clamped_knots

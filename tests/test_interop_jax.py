@@ -13,11 +13,11 @@ jax = pytest.importorskip("jax")
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.jax import control_points, plan_loss, to_jax
-from cnpgen.interop.omega import Omega
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.planner.omega import Omega
 from cnpgen.problems.load import load_problem
 
 

@@ -11,7 +11,7 @@ from conftest import needs_compiler
 from example_plans_of_networks import at_ends, boundary, outputs
 
 from cnpgen.errors import UsageError
-from cnpgen.interop.omega import Omega
+from cnpgen.planner.omega import Omega
 
 PROBLEMS = ("airhockey", "heavy-object")
 

@@ -15,12 +15,12 @@ torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader
 
 from cnpgen.errors import UsageError
-from cnpgen.interop.omega import Omega
 from cnpgen.interop.torch import BatchDataset, RowDataset, control_points, plan_loss, to_torch
 from cnpgen.loader import order
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.planner.omega import Omega
 from cnpgen.problems.load import load_problem
 
 pytestmark = [

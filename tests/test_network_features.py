@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_network_omega import tasks
 
-from cnpgen.network.features import BLOCKS, fit_features, raw_features
+from cnpgen.planner.network.features import BLOCKS, fit_features, raw_features
 
 
 def test_features_of_the_rows_they_were_fitted_to_have_mean_zero_and_deviation_one():

@@ -5,8 +5,8 @@ import pytest
 from scipy.interpolate import BSpline
 from test_trajectory_slopes import random_boundary
 
-from cnpgen.network.omega import control_points, pull_back
-from cnpgen.network.tasks import SHORTEST_TIME, Tasks, expected_time
+from cnpgen.planner.control_points import control_points, pull_back
+from cnpgen.planner.tasks import SHORTEST_TIME, Tasks, expected_time
 from cnpgen.trajectory.boundary import Boundary, anchor_line
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import clamped_knots

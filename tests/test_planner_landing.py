@@ -6,10 +6,10 @@ from conftest import columns_of
 from example_models import boundary_of_columns, surroundings_of
 from test_planner_parts import heights, worst_tilt
 
-from cnpgen.network.omega import control_points
+from cnpgen.planner.control_points import control_points
 from cnpgen.planner.kit import make_kit
 from cnpgen.planner.landing import Landing, make_landing
-from cnpgen.planner.lanes import ends_of, lanes, rows
+from cnpgen.planner.preparation import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import anchor_line, assemble
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}

@@ -12,8 +12,8 @@ from example_models import SMALL, boundary_of_columns, learner_of
 from cnpgen.certification import certified
 from cnpgen.errors import UsageError
 from cnpgen.make import make_dataset
-from cnpgen.network.architecture import initial_parameters
-from cnpgen.network.omega import ControlPoints
+from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
 from cnpgen.training.clipping import Clipping

@@ -11,7 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.losses.margins import suggested_margins
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import MetricSettings
-from cnpgen.network.architecture import Architecture
+from cnpgen.planner.network.architecture import Architecture
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.prepare import begin_run
 from cnpgen.training.schedule import learning_rate

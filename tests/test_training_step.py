@@ -7,7 +7,7 @@ import pytest
 from conftest import columns_of
 from example_models import SMALL, boundary_of_columns, learner_of
 
-from cnpgen.network.architecture import initial_parameters
+from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.training.adam import start_adam
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.rows import Rows

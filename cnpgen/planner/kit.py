@@ -12,9 +12,8 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.planner.curves import landed_path
 from cnpgen.planner.expressions import count_equalities
-from cnpgen.planner.lanes import ends_of, lanes, rows
 from cnpgen.planner.model import Model
-from cnpgen.planner.preparation import Preparation, prepare_tasks
+from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.curves import FIXED_AT_GOAL, path_bend, path_bend_adjoint
-from cnpgen.planner.lanes import lanes
+from cnpgen.planner.preparation import lanes
 from cnpgen.problems.problem import Problem
 
 Array = NDArray[Any]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.architecture import Architecture, Weights
-from cnpgen.network.features import Features
-from cnpgen.network.forward import forward
-from cnpgen.network.tasks import Tasks
+from cnpgen.planner.network.architecture import Architecture, Weights
+from cnpgen.planner.network.features import Features
+from cnpgen.planner.network.forward import forward
+from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.record import ProblemRecord
 
 Array = NDArray[Any]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, nearest
-from cnpgen.network.architecture import Architecture
-from cnpgen.network.features import BLOCKS, Features
 from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.network.architecture import Architecture
+from cnpgen.planner.network.features import BLOCKS, Features
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.sealed import Content, read_sealed, write_sealed

@@ -1,17 +1,17 @@
 """From boundary conditions to tasks: tip positions, obstacles, expected time, bent line; for training and planning."""
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.network.tasks import Tasks, expected_time
 from cnpgen.planner.curves import line_bend
 from cnpgen.planner.expressions import tip_position
-from cnpgen.planner.lanes import ends_of, lanes, rows
+from cnpgen.planner.tasks import Tasks, expected_time
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
@@ -20,6 +20,22 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
+
+
+def lanes(values: NDArray[Any]) -> Array:
+    """Turn (N, ...) into (width, N), float64."""
+    return np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64)
+
+
+def rows(values: Array, n: int) -> Array:
+    """Turn (points n, N) into (N, points, n)."""
+    return np.ascontiguousarray(values.T).reshape(values.shape[1], values.shape[0] // n, n)
+
+
+def ends_of(boundary: Boundary) -> Array:
+    """Boundary conditions of N motions as ``curves`` takes them, shape (5 n, N)."""
+    parts = (boundary.start_q, boundary.start_dq, boundary.start_ddq, boundary.goal_q, boundary.goal_dq)
+    return np.ascontiguousarray(np.concatenate(parts, axis=1).T)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.losses.plan_loss import LossValue
-from cnpgen.network.omega import ControlPoints
+from cnpgen.planner.control_points import ControlPoints
 
 Array = NDArray[Any]
 

@@ -12,10 +12,10 @@ from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.run import Run

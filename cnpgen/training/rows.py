@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.features import Features, fit_features
-from cnpgen.network.omega import ControlPoints
-from cnpgen.network.tasks import Tasks
+from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.network.features import Features, fit_features
 from cnpgen.planner.preparation import Preparation
+from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.trajectory.boundary import Boundary
 

@@ -12,8 +12,8 @@ from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_wait
-from cnpgen.network.features import Features
 from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.network.features import Features
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.journal import Journal

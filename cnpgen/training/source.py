@@ -7,7 +7,7 @@ from typing import Any
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
-from cnpgen.network.omega import ControlPoints
+from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.training.rows import boundary_columns

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.losses.plan_loss import LossValue
-from cnpgen.network.architecture import Architecture
-from cnpgen.network.forward import backward, forward
-from cnpgen.network.omega import ControlPoints, control_points, pull_back
+from cnpgen.planner.control_points import ControlPoints, control_points, pull_back
 from cnpgen.planner.landing import Landing
+from cnpgen.planner.network.architecture import Architecture
+from cnpgen.planner.network.forward import backward, forward
 from cnpgen.training.adam import Adam
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.imitation import imitation_loss

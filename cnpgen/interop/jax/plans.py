@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.interop.host import evaluate
 from cnpgen.losses.quadrature import check_quadrature
-from cnpgen.network.tasks import Tasks
+from cnpgen.planner.tasks import Tasks
 from cnpgen.schema.arguments import number, real_array
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
-    from cnpgen.interop.omega import Omega
     from cnpgen.losses.plan_loss import PlanLoss
+    from cnpgen.planner.omega import Omega
 
 for _kind in (Tasks, Boundary):
     jax.tree_util.register_dataclass(_kind, [field.name for field in fields(_kind)], [])  # jit takes them as arguments

@@ -11,9 +11,9 @@ from cnpgen.interop.host import evaluate
 from cnpgen.schema.arguments import real_array
 
 if TYPE_CHECKING:
-    from cnpgen.interop.omega import Omega
     from cnpgen.losses.plan_loss import PlanLoss
-    from cnpgen.network.tasks import Tasks
+    from cnpgen.planner.omega import Omega
+    from cnpgen.planner.tasks import Tasks
 
 Array = NDArray[Any]
 Function = Callable[..., tuple[Array, ...]]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.tasks import Tasks
+from cnpgen.planner.tasks import Tasks
 from cnpgen.trajectory.boundary import goal_points, start_points
 from cnpgen.trajectory.slopes import boundary_slopes
 from cnpgen.trajectory.spec import TrajectorySpec

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
-from cnpgen.network import omega
-from cnpgen.network.omega import ControlPoints
-from cnpgen.network.tasks import Tasks
+from cnpgen.planner import control_points
+from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.curves import FIXED_AT_GOAL
 from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
+from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.load import problem_of
 from cnpgen.problems.obstacles import obstacle_tops
@@ -151,7 +151,7 @@ class Omega:
         with np.errstate(all="ignore"):
             by_path = landing.pull_back(points.path, self.tops(tasks), path_gradient) if landing else path_gradient
             spec = self.problem.trajectory
-            found = omega.pull_back(
+            found = control_points.pull_back(
                 tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self._scale, spec=spec
             )
         lost = _finite(path_gradient, rate_gradient) & ~_finite(*found)
@@ -184,7 +184,7 @@ class Omega:
         phi, log_rate = real_array("phi", phi, "float64"), real_array("log_rate", log_rate, "float64")
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
-            return omega.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)
+            return control_points.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)
 
 
 def _finite(*arrays: NDArray[Any]) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.tasks import Tasks
+from cnpgen.planner.tasks import Tasks
 
 Array = NDArray[Any]
 

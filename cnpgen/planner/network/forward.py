@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.network.architecture import Weights
+from cnpgen.planner.network.architecture import Weights
 
 Array = NDArray[Any]
 
