@@ -24,14 +24,17 @@ from watching import MARKS, Sample, watch
 STEPS = (  # what happens before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
-    ("cnpgen.make", "import cnpgen.make"),
-    ("recipe", "from cnpgen.library import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
+    ("cnpgen.make.dataset", "import cnpgen.make.dataset"),
+    ("recipe", "from cnpgen.make.load import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
     ("Pinocchio, Coal", "import pinocchio, coal"),
-    ("kernels, plan", "cnpgen.make.plan_dataset(recipe, {out!r})"),
+    ("kernels, plan", "cnpgen.make.dataset.plan_dataset(recipe, {out!r})"),
     ("h5py", "import h5py"),
     ("joblib", "from joblib import Parallel, delayed"),
     ("2 workers", "Parallel(n_jobs=2)(delayed(abs)(i) for i in range(2))"),
-    ("cnpgen in workers", "Parallel(n_jobs=2)(delayed(cnpgen.make.plan_dataset)(recipe, {out!r}) for i in range(2))"),
+    (
+        "cnpgen in workers",
+        "Parallel(n_jobs=2)(delayed(cnpgen.make.dataset.plan_dataset)(recipe, {out!r}) for i in range(2))",
+    ),
 )
 
 

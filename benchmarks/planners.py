@@ -18,13 +18,13 @@ from common import arguments, median, progress, report, table, verdict
 from refiner_problems import grid_of_hits, make_each
 
 from cnpgen.machine.threads import one_thread
+from cnpgen.make.problems import draw_problems
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.refine.options import DEFAULT
 from cnpgen.refine.plans import refine_plans
-from cnpgen.solving import draw_problems
 
 PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000, "heavy-object": 300}
 GRID = "airhockey-hit"

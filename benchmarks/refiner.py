@@ -26,6 +26,7 @@ from refiner_problems import Made, grid_of_hits, like_a_networks, make_each
 from slsqp import minimise_slsqp
 
 from cnpgen.machine.threads import one_thread
+from cnpgen.make.problems import draw_problems
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
 from cnpgen.refine.engine import load_refiner, prepare, tasks_of
@@ -35,7 +36,6 @@ from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.proof.proof import explain_plans
 from cnpgen.refine.refiner import Passes, Refiner, default_passes
 from cnpgen.refine.solver.sqp import Settings
-from cnpgen.solving import draw_problems
 from cnpgen.trajectory.motion import Motion
 
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")

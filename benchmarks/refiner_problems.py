@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.kernels.library import choose_backend
+from cnpgen.make.problems import problems_of_rows
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
@@ -22,7 +23,6 @@ from cnpgen.refine.polish import refine_task
 from cnpgen.refine.proof.tip_bound import Arm
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Refined, Task
-from cnpgen.solving import problems_of_rows
 from cnpgen.trajectory.boundary import assemble
 from cnpgen.trajectory.motion import Motion
 

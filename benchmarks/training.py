@@ -23,7 +23,7 @@ import numpy as np
 from common import arguments, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import problem_of, read_rows

@@ -11,14 +11,15 @@ from cnpgen.machine.versions import __version__
 if TYPE_CHECKING:
     from cnpgen.doctor import check_machine
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
-    from cnpgen.library import load_dataset_recipe
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
     from cnpgen.losses.metric import Metric
     from cnpgen.losses.metric_settings import suggested_weights
     from cnpgen.losses.plan_loss import PlanLoss
     from cnpgen.losses.quadrature import rotating_shift
-    from cnpgen.make import make_dataset
+    from cnpgen.make.dataset import make_dataset
+    from cnpgen.make.load import load_dataset_recipe
+    from cnpgen.make.problems import draw_problems, load_problems
     from cnpgen.pipelines.load import load_pipeline
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.omega import Omega
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from cnpgen.refine.plans import Refinement, refine_plans
     from cnpgen.refine.proof.proof import explain_plans
     from cnpgen.schema.catalogue import list_recipes
-    from cnpgen.solving import draw_problems, load_problems
     from cnpgen.store.inspection import inspect_dataset
     from cnpgen.store.reader import open_dataset
     from cnpgen.training.settings import TrainingSettings
@@ -63,7 +63,7 @@ _HOME = {
     "TrainingSettings": "training.settings",
     "UsageError": "errors",
     "check_machine": "doctor",
-    "draw_problems": "solving",
+    "draw_problems": "make.problems",
     "evaluate_plans": "plans.evaluate",
     "explain_plans": "refine.proof.proof",
     "export_plans": "plans.export",
@@ -71,13 +71,13 @@ _HOME = {
     "inspect_dataset": "store.inspection",
     "list_recipes": "schema.catalogue",
     "load_dataset": "loader.load",
-    "load_dataset_recipe": "library",
+    "load_dataset_recipe": "make.load",
     "load_model": "planner.model_file",
     "load_pipeline": "pipelines.load",
     "load_plans": "plans.load",
     "load_problem": "problems.load",
-    "load_problems": "solving",
-    "make_dataset": "make",
+    "load_problems": "make.problems",
+    "make_dataset": "make.dataset",
     "make_plans": "plans.plans",
     "obstacle_tops": "problems.obstacles",
     "open_dataset": "store.reader",

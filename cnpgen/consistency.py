@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.library import restore_dataset_recipe
-from cnpgen.recipe import DatasetRecipe, resolved_digest
+from cnpgen.make.load import restore_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, resolved_digest
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.files.documents import load_document, plain

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.certification import PlanCheck, check_plans
 from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError, counted
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.machine.workers import share_out
+from cnpgen.make.certify import PlanCheck, check_plans
 from cnpgen.problems.robot import load_robot
 from cnpgen.shard_checks import check_numbers
 from cnpgen.store.blueprint import DatasetPlan, ShardTask

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.robot import load_robot
-from cnpgen.recipe import DatasetRecipe, recipe_digest
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, Range, keys

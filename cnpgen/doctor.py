@@ -268,7 +268,7 @@ def _check_backend(found: _Findings, cache: str) -> tuple[str, str, bool]:
 def _check_recipes(found: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
-        from cnpgen.library import load_dataset_recipe
+        from cnpgen.make.load import load_dataset_recipe
         from cnpgen.problems.robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root
 

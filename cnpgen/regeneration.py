@@ -10,9 +10,9 @@ from cnpgen.consistency import restored
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make_shard import blocks_of, shard_columns
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest
+from cnpgen.make.shards import blocks_of, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.recipe import DatasetRecipe, recipe_digest
 from cnpgen.store.blueprint import REVISION, DatasetPlan, ShardTask
 from cnpgen.store.check import Finding
 from cnpgen.store.reader import StoredDataset

@@ -19,13 +19,13 @@ import pytest
 
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
-from cnpgen.library import load_dataset_recipe
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import Batch
-from cnpgen.recipe import DatasetRecipe
 from cnpgen.robots.robot import Robot
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")

@@ -10,11 +10,11 @@ from conftest import tiny_recipe
 from tiny_datasets import make_tiny
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.library import dataset_recipe_of
-from cnpgen.make import make_dataset
-from cnpgen.make_plan import plan_dataset
+from cnpgen.make.blueprint import plan_dataset
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.load import dataset_recipe_of
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
-from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema.arguments import flag, integer, number
 from cnpgen.validation import validate_dataset
 

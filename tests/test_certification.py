@@ -10,11 +10,12 @@ import h5py
 import numpy as np
 import pytest
 
-from cnpgen.certification import NO_PLAN, CertifiedPlan, PlanCheck, certified, check_plans
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
-from cnpgen.library import load_dataset_recipe
-from cnpgen.make import make_dataset
+from cnpgen.make.certify import NO_PLAN, CertifiedPlan, PlanCheck, certified, check_plans
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.problems import load_problems, problems_of_rows
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
@@ -22,7 +23,6 @@ from cnpgen.problems.robot import load_robot
 from cnpgen.refine import polish
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Refined
-from cnpgen.solving import load_problems, problems_of_rows
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.validation import validate_dataset

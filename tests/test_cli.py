@@ -22,7 +22,7 @@ from cnpgen.cli.make_command import _yield
 from cnpgen.cli.plan_text import size_text
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
-from cnpgen.make_plan import MAX_ROWS
+from cnpgen.make.blueprint import MAX_ROWS
 from cnpgen.store.check import Finding
 from cnpgen.store.outcome import Outcome
 from cnpgen.validation import ValidationReport
@@ -348,7 +348,7 @@ def test_an_interruption_is_130_and_says_how_to_go_on(run, monkeypatch, tmp_path
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cnpgen.make.make_dataset", interrupted)
+    monkeypatch.setattr("cnpgen.make.dataset.make_dataset", interrupted)
     code, out, err = run(*MAKE, tmp_path / "x", "--quiet")
     assert (code, out) == (130, "")
     assert err == "cnpgen: interrupted: finished shards are kept, run the same command again to go on\n"

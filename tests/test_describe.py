@@ -19,7 +19,7 @@ from cnpgen.describe import (
     table,
 )
 from cnpgen.errors import RecipeError
-from cnpgen.library import load_dataset_recipe
+from cnpgen.make.load import load_dataset_recipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.problems.load import load_problem
 from cnpgen.schema import registry

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.outcome import DensityMap, Outcome
 from cnpgen.store.plot import plot_dataset

@@ -8,12 +8,12 @@ import pytest
 from example_stages import Roll
 
 from cnpgen.errors import RecipeError
-from cnpgen.library import find_recipe, load_dataset_recipe
+from cnpgen.make.load import find_recipe, load_dataset_recipe
+from cnpgen.make.recipe import recipe_digest
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import resolved
-from cnpgen.recipe import recipe_digest
 from cnpgen.schema import catalogue, registry
 from cnpgen.schema.catalogue import list_recipes, recipes_root
 from cnpgen.schema.keys import Range, field

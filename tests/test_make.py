@@ -12,14 +12,14 @@ import pytest
 from conftest import SHIPPED, TINY_SHARD, columns_of, tiny_recipe
 from tiny_datasets import SHARDS, digests, make_tiny, snapshot
 
-from cnpgen import make_shard as make
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import load_dataset_recipe
-from cnpgen.make import _part as make_part
-from cnpgen.make import is_quick, make_dataset, runs
-from cnpgen.make_plan import plan_dataset
-from cnpgen.make_shard import Job, make_shards, shard_columns
+from cnpgen.make import shards as make
+from cnpgen.make.blueprint import plan_dataset
+from cnpgen.make.dataset import _part as make_part
+from cnpgen.make.dataset import is_quick, make_dataset, runs
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.shards import Job, make_shards, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.store.blueprint import load_plan, shards
@@ -100,7 +100,7 @@ def test_another_seed_makes_other_rows(tiny: Callable[[str], Path], tmp_path):
 
 def test_a_pipeline_without_a_dataset_recipe_can_be_made(tmp_path):
     made = make_dataset("airhockey-hit", tmp_path / "a", n=50, workers=1)
-    from cnpgen.library import find_recipe
+    from cnpgen.make.load import find_recipe
 
     as_pipeline = make_dataset(find_recipe("pipeline", "airhockey-hit"), tmp_path / "b", n=50, workers=1)
     assert as_pipeline.plan.splits == {"train": 45, "validation": 5}

@@ -9,7 +9,7 @@ import pytest
 from conftest import tiny_recipe
 from tiny_datasets import digests, flip, make_tiny, snapshot
 
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.store import mending
 from cnpgen.store.blueprint import load_plan, shards
 from cnpgen.store.layout import MANIFEST
@@ -130,7 +130,7 @@ def test_a_dataset_with_a_damaged_shard_is_unfinished_until_it_is_made_good(fold
     def killed(*_arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cnpgen.make.make_shards", killed)
+    monkeypatch.setattr("cnpgen.make.dataset.make_shards", killed)
     with pytest.warns(RuntimeWarning, match="damaged"), pytest.raises(KeyboardInterrupt):
         make_tiny(folder)
     assert not (folder / MANIFEST).exists()

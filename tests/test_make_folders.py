@@ -14,7 +14,7 @@ from tiny_datasets import digests, flip, make_tiny, snapshot
 
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.blueprint import load_plan
 from cnpgen.validation import validate_dataset
@@ -258,7 +258,7 @@ def test_a_place_that_the_system_does_not_give_is_a_machine_error(capsys):
 
 def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)  # root may write everywhere
-    monkeypatch.setattr("cnpgen.make.plan_dataset", None)
+    monkeypatch.setattr("cnpgen.make.dataset.plan_dataset", None)
     code, line = refused(capsys, str(tmp_path / "new"))
     assert code == 3
     assert line.endswith("new: Permission denied; choose a folder that you may write to")

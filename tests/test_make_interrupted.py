@@ -18,8 +18,8 @@ from test_cli_interruption import descendants
 from tiny_datasets import SHARDS, digests, make_tiny
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.library import load_dataset_recipe
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.load import load_dataset_recipe
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.outcome import Outcome
 from cnpgen.validation import validate_dataset
@@ -61,8 +61,8 @@ def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, 
 CHILD = """
 import sys
 from dataclasses import replace
-from cnpgen.library import load_dataset_recipe
-from cnpgen.make import make_dataset
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.dataset import make_dataset
 if __name__ == "__main__":
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 600, "validation": 60})
     def tell(rows, outcome):

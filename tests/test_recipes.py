@@ -10,11 +10,11 @@ import pytest
 from example_stages import Roll
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.library import load_dataset_recipe
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.robots.spec import LimitSpec, Obstacle, RobotSpec
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range

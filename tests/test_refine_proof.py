@@ -13,6 +13,7 @@ from example_refiner import refine
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
+from cnpgen.make.problems import draw_problems
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.plans import refine_plans
@@ -21,7 +22,6 @@ from cnpgen.refine.proof.proof import Finding, Kind, explain_failure, explain_pl
 from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, joint_limits, moments
 from cnpgen.refine.proof.table_proof import table_bounds
 from cnpgen.refine.proof.tip_bound import Arm, bound_projection
-from cnpgen.solving import draw_problems
 from cnpgen.trajectory.boundary import Boundary
 
 LABELS = ("hit", "replan", "transport")

@@ -15,7 +15,8 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.problems import draw_problems, load_problems
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
@@ -23,7 +24,6 @@ from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Outcome
-from cnpgen.solving import draw_problems, load_problems
 
 N = 13
 

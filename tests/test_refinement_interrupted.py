@@ -13,10 +13,10 @@ from test_refinement import same
 
 from cnpgen.cli.main import main
 from cnpgen.errors import MachineError
+from cnpgen.make.problems import draw_problems
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.plans import refine_plans
-from cnpgen.solving import draw_problems
 
 N = 14
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")

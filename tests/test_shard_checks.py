@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import SHIPPED, TINY_SHARD, tiny_recipe
 
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.shard_checks import check_numbers
 from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.record import ShardRecord, load_record

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from conftest import SHIPPED
 
-from cnpgen.library import load_dataset_recipe
+from cnpgen.make.load import load_dataset_recipe
 from cnpgen.planner.model_file import load_model, shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows

@@ -10,7 +10,7 @@ from conftest import Arm, Prepare, needs_compiler, run_stages, without_stages
 from scipy.optimize import linprog
 
 from cnpgen.kernels.tape import Loop
-from cnpgen.library import find_recipe
+from cnpgen.make.load import find_recipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.braking import MAX_STEPS, STEP, SUSPECT, BrakingReach, braking_step, overshoot, tip_state

@@ -9,9 +9,9 @@ import pytest
 from conftest import columns_of, tiny_recipe
 from example_models import SMALL, boundary_of_columns, learner_of
 
-from cnpgen.certification import certified
 from cnpgen.errors import UsageError
-from cnpgen.make import make_dataset
+from cnpgen.make.certify import certified
+from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.planner.planner import Planner

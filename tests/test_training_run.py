@@ -18,7 +18,7 @@ from example_models import SMALL
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.losses.metric_settings import BOUNDED
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.training import checkpoint as checkpoints

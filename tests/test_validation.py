@@ -12,7 +12,7 @@ import pytest
 from conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, tiny_recipe
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.make import make_dataset
+from cnpgen.make.dataset import make_dataset
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import ShardTask, load_plan, shards

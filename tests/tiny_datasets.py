@@ -5,7 +5,7 @@ from pathlib import Path
 
 from conftest import TINY_SHARD, tiny_recipe
 
-from cnpgen.make import MadeDataset, make_dataset
+from cnpgen.make.dataset import MadeDataset, make_dataset
 
 SHARDS = 4  # of a tiny dataset: 250, 250 and 100 rows of training, 60 of validation
 

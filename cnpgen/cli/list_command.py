@@ -48,7 +48,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
 
 
 def _datasets() -> list[dict[str, Any]]:
-    from cnpgen.library import load_dataset_recipe
+    from cnpgen.make.load import load_dataset_recipe
     from cnpgen.schema.catalogue import list_recipes
 
     entries = []

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from cnpgen.make import MadeDataset
-    from cnpgen.recipe import DatasetRecipe
+    from cnpgen.make.dataset import MadeDataset
+    from cnpgen.make.recipe import DatasetRecipe
     from cnpgen.store.outcome import Outcome
 
 KEPT = "finished shards are kept, run the same command again to go on"
@@ -64,12 +64,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.recipe_names import check_recipe
     from cnpgen.errors import UsageError
-    from cnpgen.library import load_dataset_recipe
+    from cnpgen.make.load import load_dataset_recipe
 
     check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' goes on with it")
     recipe = load_dataset_recipe(arguments.recipe)
     if arguments.certify:
-        from cnpgen.certification import certified
+        from cnpgen.make.certify import certified
 
         if arguments.dtype == "float32":
             raise UsageError("--certify stores plans, which are exact in float64 only: leave out --dtype float32")
@@ -92,7 +92,7 @@ def _settings(arguments: argparse.Namespace) -> dict[str, object]:
 
 
 def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
-    from cnpgen.make import make_dataset
+    from cnpgen.make.dataset import make_dataset
 
     meter = Meter(quiet=arguments.quiet)
 

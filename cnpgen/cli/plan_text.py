@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.data_card import load_notes
 from cnpgen.describe import table
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.make_plan import plan_dataset
+from cnpgen.make.blueprint import plan_dataset
+from cnpgen.make.load import load_notes
 from cnpgen.store.blueprint import DatasetPlan, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.record import pending
@@ -14,7 +14,7 @@ from cnpgen.store.shard import storage_dtype
 from cnpgen.store.workspace import check_clearable, holds_plan, is_dataset
 
 if TYPE_CHECKING:
-    from cnpgen.recipe import DatasetRecipe
+    from cnpgen.make.recipe import DatasetRecipe
 
 SHARD_OVERHEAD = 41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
 DOCUMENTS = 90_000  # bytes: plan, manifest, card and statistics

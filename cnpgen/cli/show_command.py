@@ -67,7 +67,7 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
     Raises:
         RecipeError: There is none, or it has mistakes.
     """
-    from cnpgen.library import load_dataset_recipe
+    from cnpgen.make.load import load_dataset_recipe
     from cnpgen.pipelines.load import load_pipeline
     from cnpgen.problems.load import load_problem
 

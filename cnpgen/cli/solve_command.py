@@ -50,7 +50,7 @@ def _name(what: Path) -> str:
 def _problems(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.errors import UsageError
-    from cnpgen.solving import draw_problems, load_problems
+    from cnpgen.make.problems import draw_problems, load_problems
 
     if Path(arguments.what).is_dir():
         if arguments.seed is not None:

@@ -38,7 +38,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "braking-reach": "cnpgen.pipelines.stages.braking:BrakingReach",
         "collision": "cnpgen.pipelines.stages.collision:Collision",
         "gravity-torque": "cnpgen.pipelines.stages.torque:GravityTorque",
-        "certified-plan": "cnpgen.certification:CertifiedPlan",
+        "certified-plan": "cnpgen.make.certify:CertifiedPlan",
     },
     CONSTRAINTS: {
         "joint-position": "cnpgen.problems.constraints.joint:JointPosition",

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import PluginError, RecipeError, UsageError
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import read_pipeline
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
 from cnpgen.problems.problem import Problem
-from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import digest_of, find_file, load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
@@ -124,3 +124,22 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         path=pipeline.path,
         digest=digest_of(b"", pipeline.digest.encode()),
     )
+
+
+def load_notes(recipe: DatasetRecipe) -> str:
+    """Read the text beside a recipe's file, of the same name with the ending ``.md``; empty where there is none.
+
+    Raises:
+        RecipeError: It cannot be read, or is not UTF-8.
+    """
+    if not recipe.path.name:  # built in Python, from no file
+        return ""
+    card = recipe.path.with_suffix(".md")
+    try:
+        return card.read_bytes().decode("utf-8-sig") if card.is_file() else ""
+    except OSError as error:
+        raise RecipeError([f"{card}: cannot be read: {error.strerror or error}"]) from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        wrong = f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}"
+        raise RecipeError([f"{card}: {wrong}; it becomes part of the dataset's card"]) from error

@@ -9,15 +9,14 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
-from cnpgen.certification import certified
-from cnpgen.data_card import load_notes
 from cnpgen.errors import UsageError
-from cnpgen.library import dataset_recipe_of
 from cnpgen.machine.workers import share_out, worker_count
-from cnpgen.make_plan import dataset_folder, plan_dataset
-from cnpgen.make_shard import Job, make_shards
+from cnpgen.make.blueprint import dataset_folder, plan_dataset
+from cnpgen.make.certify import certified
+from cnpgen.make.load import dataset_recipe_of, load_notes
+from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.shards import Job, make_shards
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
-from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.check import check_documents

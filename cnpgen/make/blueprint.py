@@ -6,12 +6,12 @@ from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import dataset_recipe_of
 from cnpgen.machine.versions import versions
-from cnpgen.make_shard import Job
+from cnpgen.make.load import dataset_recipe_of
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
+from cnpgen.make.shards import Job
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
-from cnpgen.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import DatasetPlan, default_shard_size, load_plan
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Batch, Run, Stage
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.recipe import DatasetRecipe
 from cnpgen.store.field import Field
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion

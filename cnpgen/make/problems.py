@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.library import dataset_recipe_of
+from cnpgen.make.load import dataset_recipe_of
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.record import ProblemRecord, record_problem
-from cnpgen.recipe import DatasetRecipe
 from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 

@@ -1,0 +1,1 @@
+"""Datasets made: their recipe, the blueprint, shards, certified plans, problems to solve."""
