@@ -29,9 +29,9 @@ from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import problem_of, read_rows
 from cnpgen.refine.plans import refine_plans
 from cnpgen.training import step as parts
+from cnpgen.training.data import open_source
 from cnpgen.training.prepare import begin_run, prepare_run
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.source import open_source
 from cnpgen.training.train import train_model
 
 DATASETS = ("airhockey-hit", "heavy-object")

@@ -15,7 +15,7 @@ from cnpgen.loader.load import load_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.request_files import read_file
 from cnpgen.planner.requests import read_rows
-from cnpgen.training.source import open_source, stages_of
+from cnpgen.training.data import open_source, stages_of
 
 Tiny = Callable[[str], Path]
 

@@ -17,8 +17,8 @@ from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.imitation import imitation_loss
-from cnpgen.training.source import open_source
+from cnpgen.training.data import open_source
+from cnpgen.training.step import imitation_loss
 from cnpgen.training.train import train_model
 
 UNCLIPPED = replace(SMALL, sample_clip=np.inf, batch_clip=np.inf)

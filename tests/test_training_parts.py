@@ -12,11 +12,11 @@ from cnpgen.losses.margins import suggested_margins
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import MetricSettings
 from cnpgen.planner.network.architecture import Architecture
+from cnpgen.training.adam import learning_rate
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.prepare import begin_run
-from cnpgen.training.schedule import learning_rate
+from cnpgen.training.rows import StepRows
 from cnpgen.training.settings import METRICS, Length, TrainingSettings
-from cnpgen.training.step_rows import StepRows
 
 
 def rate(step: int) -> float:

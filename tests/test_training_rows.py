@@ -8,11 +8,10 @@ from example_models import boundary_of_columns, surroundings_of
 from cnpgen.loader.order import Order
 from cnpgen.planner.kit import make_kit
 from cnpgen.training import rows as rows_module
+from cnpgen.training.data import open_source
 from cnpgen.training.prepare import prepare_run
-from cnpgen.training.rows import prepare_rows
+from cnpgen.training.rows import StepRows, prepare_rows
 from cnpgen.training.settings import METRICS, TrainingSettings
-from cnpgen.training.source import open_source
-from cnpgen.training.step_rows import StepRows
 
 
 @pytest.mark.parametrize(("dataset", "name"), [("airhockey-replan", "airhockey"), ("heavy-object", "heavy-object")])

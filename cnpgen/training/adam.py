@@ -1,5 +1,6 @@
 """Adam (Kingma and Ba, 2015) on one flat vector, in place, with an average of the parameters beside them."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,3 +72,17 @@ class Adam:
 def start_adam(parameters: Array) -> Adam:
     """Begin with given parameters, shape (n_parameters,)."""
     return Adam(parameters, parameters.copy(), np.zeros_like(parameters), np.zeros_like(parameters))
+
+
+def learning_rate(step: int, steps: int, *, peak: float, final: float, warm_up: int) -> float:
+    """Cosine from ``peak`` to ``final * peak``, after a linear warm-up.
+
+    Args:
+        step: Steps taken.
+        steps: Steps of the whole run.
+        peak: Largest learning rate.
+        final: The last one, as a fraction of it.
+        warm_up: Steps of the warm-up.
+    """
+    falling = 0.5 * (1 + math.cos(math.pi * min(step / steps, 1.0)))
+    return peak * (final + (1 - final) * falling) * min(1.0, (step + 1) / max(warm_up, 1))

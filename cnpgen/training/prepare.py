@@ -17,13 +17,13 @@ from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
+from cnpgen.training.data import Source, stages_of
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.run import Run
+from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.source import Source, stages_of
 from cnpgen.training.state import State, start_state
 from cnpgen.training.step import Learner
-from cnpgen.training.validation import validate
 from cnpgen.trajectory.boundary import Boundary
 
 WARMING, TIMED = 10, 50  # steps taken to find out how long one takes

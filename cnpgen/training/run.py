@@ -15,13 +15,12 @@ from cnpgen.machine.signals import signals_wait
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.features import Features
 from cnpgen.problems.record import ProblemRecord
+from cnpgen.training.adam import learning_rate
 from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.training.journal import Journal
-from cnpgen.training.rows import Rows
-from cnpgen.training.schedule import learning_rate
+from cnpgen.training.log import Journal
+from cnpgen.training.rows import Rows, StepRows
 from cnpgen.training.state import Best, State, Sums
 from cnpgen.training.step import Learner
-from cnpgen.training.step_rows import StepRows
 
 Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]

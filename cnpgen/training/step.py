@@ -14,7 +14,6 @@ from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.forward import backward, forward
 from cnpgen.training.adam import Adam
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.imitation import imitation_loss
 from cnpgen.training.rows import Rows
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.trajectory.spec import TrajectorySpec
@@ -23,6 +22,22 @@ Array = NDArray[Any]
 
 
 Loss = Callable[..., LossValue]
+
+
+def imitation_loss(points: ControlPoints, shown: ControlPoints) -> LossValue:
+    """Half the squared distances of path control points [rad^2] and of the logarithms of rate control points.
+
+    Args:
+        points: Control points of N motions.
+        shown: Those of their demonstrations.
+
+    Returns:
+        Distances as ``total``, and as the only column of ``terms``; their gradients.
+    """
+    by_path = points.path - shown.path
+    logs = np.log(points.rate / shown.rate)
+    total = 0.5 * (np.einsum("ijk,ijk->i", by_path, by_path) + np.einsum("ij,ij->i", logs, logs))
+    return LossValue(total, total[:, None], by_path, logs / points.rate)
 
 
 @dataclass(frozen=True)

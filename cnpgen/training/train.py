@@ -14,14 +14,14 @@ from cnpgen.planner.requests import problem_of
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.documents import plain
 from cnpgen.training.checkpoint import Checkpoints, differences
-from cnpgen.training.journal import Journal
-from cnpgen.training.places import CHECKPOINT, LOG, check_beside, check_out, sweep_beside
+from cnpgen.training.data import Source, open_source
+from cnpgen.training.files import CHECKPOINT, LOG, check_beside, check_out, sweep_beside
+from cnpgen.training.log import Journal
 from cnpgen.training.prepare import begin_run, identity, prepare_run
 from cnpgen.training.run import Run, Watcher
+from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.source import Source, open_source
 from cnpgen.training.state import State
-from cnpgen.training.validation import validate
 
 SECONDS = 120.0  # of CPU time, if nobody says how long
 MOST_JUDGED = 2000  # validation rows that the last model is judged on

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from cnpgen.errors import UsageError
 from cnpgen.store.files.atomic import sweep_dead
-from cnpgen.training.journal import is_log
+from cnpgen.training.log import is_log
 
 CHECKPOINT, LOG, PICTURE = ".checkpoint", ".jsonl", ".png"  # in place of .h5
 
