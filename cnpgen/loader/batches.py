@@ -14,7 +14,7 @@ from cnpgen.loader.form import Form
 from cnpgen.loader.kept import Kept, make_kept
 from cnpgen.loader.order import Order
 from cnpgen.loader.position import Position, position_from_json, position_to_json
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Source
 from cnpgen.loader.windows import Windows
 from cnpgen.schema.arguments import integer
 

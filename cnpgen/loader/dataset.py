@@ -15,8 +15,7 @@ from cnpgen.loader.form import Form, make_form
 from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
-from cnpgen.loader.shards import Shard, ShardReader
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Shard, ShardReader, Source
 from cnpgen.loader.split import Split
 from cnpgen.store.blueprint import DatasetPlan
 from cnpgen.store.field import Field

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.loader.columns import Columns, tail
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Source
 from cnpgen.store.shard import storage_dtype
 
 Rows = dict[str, NDArray[Any]]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.loader.form import Form
 from cnpgen.loader.packed import Packed, empty_packed, pack, row_bytes
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Source
 
 KEEP_BYTES = 1 << 28
 

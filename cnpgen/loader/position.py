@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Source
 from cnpgen.schema.arguments import flag, integer
 
 FORMAT = "cnpgen-loader-state"

@@ -125,3 +125,27 @@ def _check_field(shard: Shard, field: Field, found: Placement | None) -> None:
     if found is None or found.shape != shape or found.dtype.kind != kind:
         text = "is missing" if found is None else f"is {found.dtype} of shape {found.shape}"
         raise DatasetError(f"{shard.path}: field {field.name!r} {text}; the plan says {field.dtype} of shape {shape}")
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The shards of a split.
+
+    Attributes:
+        split: Name of the split.
+        shards: Its shards that are there, in order.
+        reader: Reads them.
+        fingerprint: Fingerprint of the whole dataset's rows.
+        stored: Type that fields of numbers are stored in, "float64" or "float32".
+    """
+
+    split: str
+    shards: tuple[Shard, ...]
+    reader: ShardReader
+    fingerprint: str
+    stored: str
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return sum(shard.rows for shard in self.shards)

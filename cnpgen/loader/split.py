@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from cnpgen.loader.form import Form
 from cnpgen.loader.gather import Rows, gather
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Source
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,21 +2,43 @@
 
 import os
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from threading import Thread
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader.ahead import start
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.form import Form
 from cnpgen.loader.kept import Kept
 from cnpgen.loader.order import Order
 from cnpgen.loader.packed import Packed, empty_packed, pack
-from cnpgen.loader.source import Source
+from cnpgen.loader.shards import Source
 
 Loaded = tuple[Packed, NDArray[np.int64]]
+
+
+T = TypeVar("T")
+
+
+def start(task: Callable[[], T]) -> "Future[T]":
+    """Run a task in a new thread, which ends with it: no pool is left for a fork or an exit to stumble over.
+
+    Returns:
+        Its future; what the task raises, ``result()`` raises.
+    """
+    future: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(task())
+        except BaseException as error:  # noqa: BLE001 - not swallowed: handed over to whoever asks for the result
+            future.set_exception(error)
+
+    Thread(target=run, name="cnpgen-loader").start()
+    return future
 
 
 class Windows:
