@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.machine.versions import __version__
 
 if TYPE_CHECKING:
-    from cnpgen.doctor import check_machine
     from cnpgen.errors import CnpgenError, DatasetError, MachineError, RecipeError, UsageError
     from cnpgen.loader.load import load_dataset
     from cnpgen.losses.margins import Margins
@@ -42,7 +41,8 @@ if TYPE_CHECKING:
     from cnpgen.trajectory.boundary import Boundary
     from cnpgen.trajectory.fit import fit_motion
     from cnpgen.trajectory.motion import Motion
-    from cnpgen.validation import validate_dataset
+    from cnpgen.validate.dataset import validate_dataset
+    from cnpgen.validate.machine import check_machine
 
 _HOME = {
     "Boundary": "trajectory.boundary",
@@ -62,7 +62,7 @@ _HOME = {
     "Refinement": "refine.plans",
     "TrainingSettings": "training.settings",
     "UsageError": "errors",
-    "check_machine": "doctor",
+    "check_machine": "validate.machine",
     "draw_problems": "make.problems",
     "evaluate_plans": "plans.evaluate",
     "explain_plans": "refine.proof.proof",
@@ -87,7 +87,7 @@ _HOME = {
     "states_at": "planner.planner",
     "suggested_weights": "losses.metric_settings",
     "train_model": "training.train",
-    "validate_dataset": "validation",
+    "validate_dataset": "validate.dataset",
 }
 
 __all__ = [

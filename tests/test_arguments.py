@@ -16,7 +16,7 @@ from cnpgen.make.load import dataset_recipe_of
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.schema.arguments import flag, integer, number
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3)])

@@ -25,7 +25,7 @@ from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Refined
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
 
 ROWS = 12
 

@@ -25,7 +25,7 @@ from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.make.blueprint import MAX_ROWS
 from cnpgen.store.check import Finding
 from cnpgen.store.outcome import Outcome
-from cnpgen.validation import ValidationReport
+from cnpgen.validate.dataset import ValidationReport
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
 MAKE = ("make-dataset", "airhockey-hit", "--n", "200", "--workers", "1", "--out")
@@ -547,7 +547,7 @@ def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):
         wanted.update(options)
         return ValidationReport(folder, 18, findings)
 
-    monkeypatch.setattr("cnpgen.validation.validate_dataset", validate)
+    monkeypatch.setattr("cnpgen.validate.dataset.validate_dataset", validate)
     code, out, err = run("validate", hits, "--regenerate", "3")
     assert code == 1
     lines = ["train/shard-00000.h5: is missing", "plan.json: was changed", "note: mine.txt: is not part of the dataset"]

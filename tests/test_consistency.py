@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from cnpgen.consistency import check_recipe, check_statistics
 from cnpgen.store.blueprint import load_plan
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import finalize
 from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.documents import check_recipe, check_statistics
 
 
 def test_the_recipe_in_a_plan_must_be_the_one_whose_digest_is_recorded(damaged):

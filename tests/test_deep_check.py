@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.deep_check import row_keys
+from cnpgen.validate.rows import row_keys
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen import doctor
-from cnpgen.doctor import check_machine, vector_instructions
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.machine import threads
+from cnpgen.validate import machine
+from cnpgen.validate.machine import check_machine, vector_instructions
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_this_machine_is_well():
 
 def test_every_dependency_is_looked_for():
     declared = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert sorted(doctor.NEEDED.values()) == sorted(re.split("[<>=]", each)[0] for each in declared["dependencies"])
+    assert sorted(machine.NEEDED.values()) == sorted(re.split("[<>=]", each)[0] for each in declared["dependencies"])
 
 
 def test_the_report_is_frozen_and_has_a_json_form():
@@ -68,7 +68,7 @@ def _import_failing(monkeypatch, broken, error):
             raise error
         return original(name, *rest)
 
-    monkeypatch.setattr(doctor.importlib, "import_module", fail)
+    monkeypatch.setattr(machine.importlib, "import_module", fail)
 
 
 def test_a_missing_library_is_named_with_its_project(monkeypatch):
@@ -134,7 +134,7 @@ def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(monkeypatch, t
 
 
 def test_a_container_with_fewer_cores_is_a_note(monkeypatch):
-    monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda _pid: set(range(64)), raising=False)
+    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _pid: set(range(64)), raising=False)
     report = check_machine()
     assert report.cores < 64
     assert any("--workers" in note for note in report.notes)
@@ -148,7 +148,7 @@ def test_recipes_that_do_not_load_are_a_problem(monkeypatch, tmp_path):
 
 
 def test_little_free_disk_is_a_note(monkeypatch):
-    monkeypatch.setattr(doctor, "ENOUGH_DISK", 10**30)
+    monkeypatch.setattr(machine, "ENOUGH_DISK", 10**30)
     assert any("MB are free" in note for note in check_machine().notes)
 
 
@@ -157,13 +157,13 @@ def test_little_free_disk_is_a_note(monkeypatch):
     [("sse2 avx avx2 avx512f", "avx512"), ("sse2 avx avx2", "avx2"), ("sse2", "sse2"), ("none", "unknown")],
 )
 def test_vector_instructions_are_read_from_cpuinfo(monkeypatch, flags, name):
-    monkeypatch.setattr(doctor.platform, "machine", lambda: "x86_64")
-    monkeypatch.setattr(doctor.Path, "read_text", lambda *_, **__: f"processor : 0\nflags\t\t: fpu {flags}\n")
+    monkeypatch.setattr(machine.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(machine.Path, "read_text", lambda *_, **__: f"processor : 0\nflags\t\t: fpu {flags}\n")
     assert vector_instructions() == name
 
 
 def test_arm_has_neon(monkeypatch):
-    monkeypatch.setattr(doctor.platform, "machine", lambda: "arm64")
+    monkeypatch.setattr(machine.platform, "machine", lambda: "arm64")
     assert vector_instructions() == "neon"
 
 

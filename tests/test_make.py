@@ -28,7 +28,7 @@ from cnpgen.store.manifest import load_manifest
 from cnpgen.store.outcome import Outcome
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import open_workspace
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
 
 # --- the same rows however they are made ------------------------------------------------------------------------------
 

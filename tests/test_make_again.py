@@ -14,7 +14,7 @@ from cnpgen.store import mending
 from cnpgen.store.blueprint import load_plan, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
 
 DOCUMENTS = ("manifest.json", "stats.json", "README.md", "croissant.json")
 

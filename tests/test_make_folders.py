@@ -17,7 +17,7 @@ from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.blueprint import load_plan
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
 
 
 @pytest.fixture

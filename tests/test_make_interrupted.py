@@ -22,7 +22,7 @@ from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.outcome import Outcome
-from cnpgen.validation import validate_dataset
+from cnpgen.validate.dataset import validate_dataset
 
 ROOT = Path(__file__).parents[1]
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")

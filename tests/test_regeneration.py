@@ -5,21 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen import regeneration
-from cnpgen.regeneration import Regeneration, make_again
 from cnpgen.store.blueprint import REVISION, load_plan, shards
+from cnpgen.validate import blocks
+from cnpgen.validate.blocks import Regeneration, make_again
 
 
 @pytest.fixture
 def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A dataset whose draws another version would solve differently."""
-    real = regeneration.shard_columns
+    real = blocks.shard_columns
 
     def shard_columns(*arguments):
         for columns, outcome in real(*arguments):
             yield {**columns, "start_q": columns["start_q"] + 1e-3}, outcome
 
-    monkeypatch.setattr(regeneration, "shard_columns", shard_columns)
+    monkeypatch.setattr(blocks, "shard_columns", shard_columns)
     return damaged
 
 
@@ -36,13 +36,13 @@ def test_what_differs_is_named_and_by_how_much(different):
 
 
 def test_another_revision_of_the_generator_is_an_explanation(different, monkeypatch):
-    monkeypatch.setattr(regeneration, "REVISION", REVISION + 1)
+    monkeypatch.setattr(blocks, "REVISION", REVISION + 1)
     expected = f"(made with other versions: revision of the generator {REVISION} -> {REVISION + 1})"
     assert problem_of(different).endswith(expected)
 
 
 def test_other_libraries_are_an_explanation(different, monkeypatch):
-    monkeypatch.setattr(regeneration, "versions", lambda: {**load_plan(different).versions, "numpy": "0.1"})
+    monkeypatch.setattr(blocks, "versions", lambda: {**load_plan(different).versions, "numpy": "0.1"})
     assert problem_of(different).endswith(f"numpy {np.__version__} -> 0.1)")
 
 

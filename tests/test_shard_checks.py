@@ -10,11 +10,11 @@ import pytest
 from conftest import SHIPPED, TINY_SHARD, tiny_recipe
 
 from cnpgen.make.dataset import make_dataset
-from cnpgen.shard_checks import check_numbers
 from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
 from cnpgen.store.record import ShardRecord, load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.store.statistics import column_statistics
+from cnpgen.validate.numbers import check_numbers
 
 Columns = dict[str, np.ndarray]
 Parts = tuple[DatasetPlan, ShardTask, Columns, ShardRecord]

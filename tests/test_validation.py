@@ -23,7 +23,7 @@ from cnpgen.store.manifest import finalize
 from cnpgen.store.record import load_record, save_record
 from cnpgen.store.shard import read_shard
 from cnpgen.store.statistics import column_statistics
-from cnpgen.validation import ValidationReport, validate_dataset
+from cnpgen.validate.dataset import ValidationReport, validate_dataset
 
 Tiny = Callable[[str], Path]
 FILES = [

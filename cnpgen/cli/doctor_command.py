@@ -8,7 +8,7 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
-    from cnpgen.doctor import MachineReport
+    from cnpgen.validate.machine import MachineReport
 
 
 _TEXT = """\
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     import json
 
-    from cnpgen.doctor import check_machine
+    from cnpgen.validate.machine import check_machine
 
     report = check_machine()
     print(json.dumps(report.to_dict(), indent=2) if arguments.json else machine_text(report))

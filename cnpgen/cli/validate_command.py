@@ -9,7 +9,7 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
-    from cnpgen.validation import ValidationReport
+    from cnpgen.validate.dataset import ValidationReport
 
 _TEXT = """\
 Always checked: that every file is there, whole (sha256) and what the plan and the manifest say. --deep reads every row:
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _validate(arguments: argparse.Namespace) -> "ValidationReport":
-    from cnpgen.validation import validate_dataset
+    from cnpgen.validate.dataset import validate_dataset
 
     options = {"deep": arguments.deep, "regenerate": arguments.regenerate, "workers": arguments.workers}
     rows = _rows(arguments.folder) if arguments.deep else 0

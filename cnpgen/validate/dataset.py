@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cnpgen.consistency import check_recipe, check_statistics, restored
-from cnpgen.deep_check import DeepCheck, check_rows
 from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.report import RowReport
 from cnpgen.machine.workers import worker_count
-from cnpgen.regeneration import Regeneration, backend_of, make_again
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import DatasetPlan, load_plan, shards
 from cnpgen.store.check import Finding, check_dataset
@@ -18,6 +15,9 @@ from cnpgen.store.layout import PLAN
 from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
+from cnpgen.validate.blocks import Regeneration, backend_of, make_again
+from cnpgen.validate.documents import check_recipe, check_statistics, restored
+from cnpgen.validate.rows import DeepCheck, check_rows
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.consistency import restored
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
@@ -16,6 +15,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.blueprint import REVISION, DatasetPlan, ShardTask
 from cnpgen.store.check import Finding
 from cnpgen.store.reader import StoredDataset
+from cnpgen.validate.documents import restored
 
 PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
 PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.consistency import restored
 from cnpgen.errors import CnpgenError, counted
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.machine.workers import share_out
 from cnpgen.make.certify import PlanCheck, check_plans
 from cnpgen.problems.robot import load_robot
-from cnpgen.shard_checks import check_numbers
 from cnpgen.store.blueprint import DatasetPlan, ShardTask
 from cnpgen.store.check import DELETE, Finding
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
+from cnpgen.validate.documents import restored
+from cnpgen.validate.numbers import check_numbers
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 

@@ -1,0 +1,1 @@
+"""Is it right? Datasets by files, rows, numbers, documents and blocks; this machine."""
