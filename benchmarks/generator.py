@@ -14,7 +14,7 @@ from typing import Any
 
 from common import arguments, median, progress, report, table, verdict
 
-from cnpgen.describe import kind_name
+from cnpgen.cli.describe import kind_name
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline

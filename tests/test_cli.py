@@ -17,9 +17,9 @@ import pytest
 
 import cnpgen.errors
 from cnpgen.cli import values
+from cnpgen.cli.dry_run import size_text
 from cnpgen.cli.main import main
 from cnpgen.cli.make_command import _yield
-from cnpgen.cli.plan_text import size_text
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.make.blueprint import MAX_ROWS

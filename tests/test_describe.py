@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.describe import (
+from cnpgen.cli.describe import (
     WIDTH,
     describe,
     describe_kind,

@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def inspection_text(found: "Inspection") -> str:
     """Lay out an inspection for people."""
-    from cnpgen.describe import table
+    from cnpgen.cli.describe import table
 
     plan = found.plan
     sections = [[f"{plan.name} {plan.version}  {plan.title}".rstrip(), *table(_facts(found), indent="  ")]]
@@ -61,7 +61,7 @@ def inspection_text(found: "Inspection") -> str:
 
 
 def _facts(found: "Inspection") -> list[tuple[str, str]]:
-    from cnpgen.cli.plan_text import size_text
+    from cnpgen.cli.dry_run import size_text
 
     plan = found.plan
     splits = [
@@ -83,7 +83,7 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
 
 def _yield_lines(outcome: "Outcome") -> list[str]:
     """Lay out the fates of the draws, in pipeline order."""
-    from cnpgen.describe import table
+    from cnpgen.cli.describe import table
 
     rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{outcome.tried:,}", "", "100.00 %")]
     left, before = outcome.tried, ""

@@ -99,7 +99,7 @@ def _problems() -> list[dict[str, Any]]:
 
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
-    from cnpgen.describe import kind_summary
+    from cnpgen.cli.describe import kind_summary
     from cnpgen.errors import RecipeError
     from cnpgen.schema import registry
 
@@ -110,7 +110,7 @@ def _summary(group: str, name: str) -> str:
 
 
 def _section(what: str, entries: list[dict[str, Any]]) -> str:
-    from cnpgen.describe import table
+    from cnpgen.cli.describe import table
 
     rows = [(entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"]) for entry in entries]
     return "\n".join([f"{what}  ({_HOW[what]})", *(table(rows, indent="  ", one_line=True) if rows else ["  none"])])

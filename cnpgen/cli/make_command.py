@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise UsageError("--certify stores plans, which are exact in float64 only: leave out --dtype float32")
         recipe = certified(recipe)
     if arguments.dry_run:
-        from cnpgen.cli.plan_text import plan_text
+        from cnpgen.cli.dry_run import plan_text
 
         print(plan_text(recipe, **_settings(arguments), force=arguments.force))
         return 0

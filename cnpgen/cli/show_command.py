@@ -10,7 +10,7 @@ from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import RecipeError, UsageError, nearest
 
 if TYPE_CHECKING:
-    from cnpgen.describe import Recipe
+    from cnpgen.cli.describe import Recipe
     from cnpgen.schema.toml import Kind
 
 KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
@@ -41,7 +41,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen import describe
+    from cnpgen.cli import describe
     from cnpgen.schema import registry
     from cnpgen.store.files.documents import plain, render
 

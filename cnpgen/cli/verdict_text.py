@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.describe import table
+from cnpgen.cli.describe import table
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.describe import table
+from cnpgen.cli.describe import table
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.blueprint import plan_dataset
 from cnpgen.make.load import load_notes
