@@ -60,7 +60,7 @@ def judged(plans: Plans) -> tuple[list[Verdict], float]:
 def state_by_state(plans: Plans) -> tuple[list[dict[str, float]], float]:
     """Measure every constraint at every moment; return condition -> severity of each plan, and the CPU time [s]."""
     problem, robot = open_problem(plans.problem)
-    world = World(problem, robot)
+    world = World(robot, problem.obstacle, problem.object_size)
     tops = obstacle_tops(problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
     start, found = time.process_time(), []
     for index, motion in enumerate(plans.motion[[i]] for i in range(len(plans))):

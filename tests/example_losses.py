@@ -81,7 +81,7 @@ def step_losses(problem: str, at: States, tops: np.ndarray) -> np.ndarray:
     Robot clearance is only right where the robot does not enter an obstacle: Coal's distance of a segment is 0 there.
     """
     robot, chosen = ROBOTS[problem], PROBLEMS[problem]
-    world, rows = World(chosen, robot), []
+    world, rows = World(robot, chosen.obstacle, chosen.object_size), []
     for q, dq, ddq in zip(at.q, at.dq, at.ddq, strict=True):
         world.set_state(q, dq, ddq, tops)
         row = [1 + chosen.objective.centrifugal * centrifugal(problem, q, dq, ddq)]

@@ -35,7 +35,14 @@ def refiner(name: str, criterion: Criterion | None = None) -> Refiner:
 def refiner_of(problem: Problem, criterion: Criterion | None = None, **options: object) -> Refiner:
     """The refiner of a problem whose residuals are those of the shipped one."""
     robot, kernels = ROBOTS[problem.name], library(problem.name)
-    return Refiner(problem, robot, kernels=kernels, world=World(problem, robot), criterion=criterion, **options)
+    return Refiner(
+        problem,
+        robot,
+        kernels=kernels,
+        world=World(robot, problem.obstacle, problem.object_size),
+        criterion=criterion,
+        **options,
+    )
 
 
 def tops(plan: Plan) -> np.ndarray:

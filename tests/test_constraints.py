@@ -67,7 +67,7 @@ class Bench:
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.robot = problem, load_robot(problem)
-        self.world = World(problem, self.robot)
+        self.world = World(self.robot, problem.obstacle, problem.object_size)
 
     def state(self, q: Any, dq: Any = 0.0, ddq: Any = 0.0, tops: Any = -5.0) -> World:
         n, m = self.robot.n, len(self.problem.obstacle)

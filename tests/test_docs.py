@@ -141,7 +141,11 @@ def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states
     problem = load_problem("airhockey")
     robot = load_robot(problem)
     q = np.linspace(robot.base, 0.5 * robot.base, 20).T
-    path, world, still = PathWorld(problem, robot), World(problem, robot), np.zeros((robot.n, 20))
+    path, world, still = (
+        PathWorld(robot, problem.obstacle, problem.object_size),
+        World(robot, problem.obstacle, problem.object_size),
+        np.zeros((robot.n, 20)),
+    )
     path.set_path(q, still, still, np.zeros(0))
     (along,) = keep_out.measured(path)
     single = []

@@ -34,7 +34,7 @@ def one_by_one(problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], top
     """The same states, each in a world of its own."""
     worlds = []
     for q, dq, ddq in zip(*(values.T for values in path), strict=True):
-        world = World(problem, robot)
+        world = World(robot, problem.obstacle, problem.object_size)
         world.set_state(q.copy(), dq.copy(), ddq.copy(), tops)
         worlds.append(world)
     return worlds
@@ -44,7 +44,7 @@ def one_by_one(problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], top
 def both(request: pytest.FixtureRequest) -> tuple[PathWorld, list[World]]:
     problem, robot = PROBLEMS[request.param], ROBOTS[request.param]
     path, tops = wandering(robot, seed=1), np.full(len(problem.obstacle), 0.3)
-    world = PathWorld(problem, robot)
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
     world.set_path(*path, tops)
     return world, one_by_one(problem, robot, path, tops)
 
@@ -85,17 +85,19 @@ def test_measured_constraints_are_those_of_every_single_state(both):
 
 def test_an_object_is_needed_to_measure_its_distances():
     with pytest.raises(RecipeError, match="no \\[object\\]"):
-        PathWorld(PROBLEMS["airhockey"], ROBOTS["airhockey"]).object_distances()
+        PathWorld(
+            ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size
+        ).object_distances()
 
 
 def test_without_obstacles_there_are_no_distances():
-    world = PathWorld(PROBLEMS["airhockey"], ROBOTS["airhockey"])
+    world = PathWorld(ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size)
     world.set_path(*wandering(world.robot, seed=2), np.zeros(0))
     assert world.segment_distances() == []
 
 
 def test_states_that_are_not_finite_have_no_distances():
-    world = PathWorld(PROBLEMS["heavy-object"], ROBOTS["heavy-object"])
+    world = PathWorld(ROBOTS["heavy-object"], PROBLEMS["heavy-object"].obstacle, PROBLEMS["heavy-object"].object_size)
     q, dq, ddq = wandering(world.robot, seed=3, count=5)
     q[2, 3] = np.nan
     world.set_path(q, dq, ddq, np.full(2, 0.3))
@@ -106,7 +108,7 @@ def test_states_that_are_not_finite_have_no_distances():
 
 
 def brute_force(world: PathWorld, problem: Problem, tops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    one = World(problem, world.robot)
+    one = World(world.robot, problem.obstacle, problem.object_size)
     segments, objects = [], []
     for state in zip(world.q.T, world.dq.T, world.ddq.T, strict=True):
         one.set_state(*(values.copy() for values in state), tops)
@@ -127,7 +129,10 @@ def assert_nothing_is_hidden(found: list[np.ndarray], expected: np.ndarray) -> N
 @pytest.mark.parametrize("seed", range(6))
 def test_skipping_agrees_with_brute_force_on_random_motions(seed):
     """Random motions run through the pedestals as often as they stay clear of them."""
-    problem, world = PROBLEMS["heavy-object"], PathWorld(PROBLEMS["heavy-object"], ROBOTS["heavy-object"])
+    problem, world = (
+        PROBLEMS["heavy-object"],
+        PathWorld(ROBOTS["heavy-object"], PROBLEMS["heavy-object"].obstacle, PROBLEMS["heavy-object"].object_size),
+    )
     tops = np.random.default_rng(seed).uniform(-0.3, 0.6, 2)
     world.set_path(*wandering(world.robot, seed=10 + seed, count=400), tops)
     segments, objects = brute_force(world, problem, tops)
@@ -140,7 +145,7 @@ def test_skipping_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal
     motion = Motion(np.array([plan["path"]]), np.array([plan["rate"]]))
     states = motion.at(np.linspace(0, 1, 700))
     world, tops = (
-        PathWorld(problem, ROBOTS["heavy-object"]),
+        PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size),
         np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15,
     )
     world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, tops)
@@ -152,7 +157,7 @@ def test_skipping_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal
 def test_nearly_all_states_are_skipped(monkeypatch: pytest.MonkeyPatch):
     problem, plan = PROBLEMS["heavy-object"], PLANS["transport"]
     states = Motion(np.array([plan["path"]]), np.array([plan["rate"]])).at(np.linspace(0, 1, 1500))
-    world = PathWorld(problem, ROBOTS["heavy-object"])
+    world = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size)
     tops = np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15
     world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, tops)
     calls = []
@@ -165,7 +170,7 @@ def test_nearly_all_states_are_skipped(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_path_is_forgotten_when_the_next_one_is_set():
-    world = PathWorld(PROBLEMS["airhockey"], ROBOTS["airhockey"])
+    world = PathWorld(ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size)
     first, second = wandering(world.robot, seed=6), wandering(world.robot, seed=7)
     world.set_path(*first, np.zeros(0))
     before = world.torque, world.tip_velocity

@@ -93,7 +93,7 @@ def test_the_objective_is_an_integral_over_time_as_pinocchio_evaluates_it(kind: 
     added = with_it.value(x)[0] - without.value(x)[0]
     exact = Motion(without.unpack(x)[0][None], plan.motion.rate)  # with its boundary control points recomputed
     s = chebyshev(3000)
-    states, world = exact.at(s), World(plan.problem, plan.robot)
+    states, world = exact.at(s), World(plan.robot, plan.problem.obstacle, plan.problem.object_size)
     density = np.empty(len(s))
     for i, state in enumerate(zip(states.q[0], states.dq[0], states.ddq[0], strict=True)):
         world.set_state(*state, tops(plan))
@@ -472,14 +472,14 @@ class TipSpeed(Constraint):
 def test_a_slow_down_is_as_large_as_the_bound_asks_for_whatever_its_size(tmp_path: Path) -> None:
     plan = load("transport")
     states = plan.motion.at(np.linspace(0, 1, 500))
-    world, fastest = World(plan.problem, plan.robot), 0.0
+    world, fastest = World(plan.robot, plan.problem.obstacle, plan.problem.object_size), 0.0
     for state in zip(states.q[0], states.dq[0], states.ddq[0], strict=True):
         world.set_state(*state, tops(plan))
         fastest = max(fastest, float(np.linalg.norm(world.tip_velocity)))
     limit = TipSpeed(highest=fastest / 1.05)
     problem = replace(plan.problem, constraint=(*plan.problem.constraint, limit))
     kernels = KernelLibrary("numpy", tmp_path, problem.digest, {"robot": plan.robot, "problem": problem})
-    world = World(problem, plan.robot)
+    world = World(plan.robot, problem.obstacle, problem.object_size)
     tool = Refiner(problem, plan.robot, kernels=kernels, world=world, settings=Settings(max_iterations=0))
     jury = Jury(problem, plan.robot, degree=7)
     found = refine_task(tool, jury, task(plan, path=plan.motion.path[0], rate=plan.motion.rate[0]))

@@ -35,7 +35,7 @@ def anywhere(heavy: PreparedPipeline) -> tuple[Array, Array]:
 @pytest.fixture(scope="module")
 def measured(heavy: PreparedPipeline, anywhere: tuple[Array, Array]) -> tuple[Array, Array]:
     """The verifier's smallest distance of the arm's segments and of the object, by Coal."""
-    world = World(heavy.context.problem, heavy.context.robot)
+    world = World(heavy.context.robot, heavy.context.problem.obstacle, heavy.context.problem.object_size)
     zero, arm, held = np.zeros(7), [], []
     for q, tops in zip(*(values.T for values in anywhere), strict=True):
         world.set_state(q, zero, zero, tops)

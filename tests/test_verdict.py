@@ -121,7 +121,10 @@ def _relative(plan: Plan, name: str) -> np.ndarray:
 def test_distances_from_the_pedestals_are_those_of_coal_at_every_state(label, by):
     plan = bent(load(label), by)
     verdict, seen = plan.judged(), course(plan, 1501)
-    world, tops = World(plan.problem, plan.robot), np.array([plan.start_xyz[0, 2], plan.goal_xyz[0, 2]]) - 0.15
+    world, tops = (
+        World(plan.robot, plan.problem.obstacle, plan.problem.object_size),
+        np.array([plan.start_xyz[0, 2], plan.goal_xyz[0, 2]]) - 0.15,
+    )
     segments, objects = [], []
 
     def distances(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[float, float]:

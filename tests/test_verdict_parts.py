@@ -11,7 +11,10 @@ from cnpgen.world.state import World
 
 def names(problem_name: str) -> dict[str, list[str]]:
     """Condition -> names of its values."""
-    problem, world = PROBLEMS[problem_name], World(PROBLEMS[problem_name], ROBOTS[problem_name])
+    problem, world = (
+        PROBLEMS[problem_name],
+        World(ROBOTS[problem_name], PROBLEMS[problem_name].obstacle, PROBLEMS[problem_name].object_size),
+    )
     return {
         condition.name: [name_part(problem, constraint, condition, part) for part in range(len(condition.g))]
         for constraint in problem.constraint

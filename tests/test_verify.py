@@ -622,11 +622,14 @@ def test_scene_measures_how_deep_an_object_enters(turn, depth):
 
 def test_distance_of_an_object_that_is_not_held_is_refused(hits):
     with pytest.raises(RecipeError, match="no \\[object\\]"):
-        World(AIRHOCKEY, hits.robot).object_distances()
+        World(hits.robot, AIRHOCKEY.obstacle, AIRHOCKEY.object_size).object_distances()
 
 
 def test_state_of_a_world_is_replaced_as_a_whole(carries):
-    world, fresh = World(HEAVY, carries.robot), World(HEAVY, carries.robot)
+    world, fresh = (
+        World(carries.robot, HEAVY.obstacle, HEAVY.object_size),
+        World(carries.robot, HEAVY.obstacle, HEAVY.object_size),
+    )
     tops, zero = np.array([0.3, 0.4]), np.zeros(7)
     world.set_state(carries.columns["goal_q"][0], zero + 1, zero + 2, tops + 1)
     _ = world.torque, world.tip_velocity, world.segment_distances(), world.object_distances()

@@ -79,7 +79,7 @@ class CertifiedPlan(Stage):
             problem,
             robot,
             kernels=context.kernels,
-            world=World(problem, robot),
+            world=World(robot, problem.obstacle, problem.object_size),
             criterion=choose_criterion(problem),
         )
 

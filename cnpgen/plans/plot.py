@@ -89,7 +89,7 @@ def _along(problem: Problem, robot: Robot, motion: Motion, index: int) -> tuple[
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
     if not np.all(np.isfinite([q, dq, ddq])):
         raise UsageError(f"plan {index} cannot be drawn: its numbers are not finite")
-    world = PathWorld(problem, robot)
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
     world.set_path(q, dq, ddq, np.zeros(len(problem.obstacle)))
     return world, s, t
 

@@ -59,6 +59,11 @@ class Problem:
             )
 
     @property
+    def object_size(self) -> tuple[float, float, float] | None:
+        """Edge lengths of the held object [m], None if nothing is held."""
+        return None if self.object is None else self.object.size
+
+    @property
     def urdf_path(self) -> Path:
         """The URDF file."""
         return self.path.parent / self.robot.urdf

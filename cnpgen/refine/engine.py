@@ -98,7 +98,7 @@ def load_refiner(
         problem,
         robot,
         kernels=kernels,
-        world=World(problem, robot),
+        world=World(robot, problem.obstacle, problem.object_size),
         spec=spec,
         criterion=choose_criterion(problem, options.objective, options.weight),
         settings=settings,

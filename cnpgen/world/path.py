@@ -1,5 +1,6 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
+from collections.abc import Sequence
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -13,8 +14,8 @@ from cnpgen.world.sweep import sweep
 from cnpgen.world.trace import trace
 
 if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
+    from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,7 @@ _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 class PathWorld:
-    """The robot of a problem along a path, among the obstacles.
+    """A robot along a path, among the obstacles.
 
     It answers what ``cnpgen.world.state.World`` answers, with a trailing axis of K states, so that a constraint's
     ``measured`` form, written for one state, gives arrays of shape (K,). ``set_path`` runs the forward kinematics;
@@ -30,8 +31,9 @@ class PathWorld:
     and one thread: Pinocchio's and Coal's memory is reused from path to path.
 
     Args:
-        problem: The problem.
-        robot: Its robot.
+        robot: The robot.
+        obstacles: The boxes of the world.
+        object_size: Edge lengths of the held object [m], or None.
 
     Attributes:
         robot: The robot.
@@ -42,20 +44,25 @@ class PathWorld:
         tip_rotation: Rotation matrices of the tip frame, shape (3, 3, K).
     """
 
-    def __init__(self, problem: "Problem", robot: "Robot") -> None:
+    def __init__(
+        self,
+        robot: "Robot",
+        obstacles: "Sequence[Obstacle]" = (),
+        object_size: tuple[float, float, float] | None = None,
+    ) -> None:
         import pinocchio as pin
 
         self.robot = robot
-        self._obstacles = problem.obstacle
+        self._obstacles = tuple(obstacles)
         self._model = robot.model
         self._data = self._model.createData()
         self._pool = pin.ModelPool(self._model, 1)
         self._tip = self._model.getFrameId(robot.tip)
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
-        self._object_size = None if problem.object is None else np.array(problem.object.size)
-        self._scene = Scene(problem.obstacle, None if problem.object is None else problem.object.size, 1)
+        self._object_size = None if object_size is None else np.array(object_size)
+        self._scene = Scene(obstacles, object_size, 1)
         rest = np.zeros((robot.n, 1))
-        self.set_path(robot.base[:, None], rest, rest, np.zeros(len(problem.obstacle)))
+        self.set_path(robot.base[:, None], rest, rest, np.zeros(len(obstacles)))
 
     def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array) -> None:
         """Move to K states.

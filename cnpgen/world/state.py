@@ -1,5 +1,6 @@
 """One robot state as Pinocchio and Coal see it: what the constraints' ``measured`` forms ask of it."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,21 +10,22 @@ from cnpgen.errors import RecipeError
 from cnpgen.world.scene import Scene
 
 if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
+    from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
 
 
 class World:
-    """The robot of a problem at one state, among the obstacles.
+    """A robot at one state, among the obstacles.
 
     ``set_state`` runs the forward kinematics; everything else is computed when it is read. Vectors are in the world
     frame. A world belongs to one process and one thread: Pinocchio's and Coal's memory is reused from state to state.
 
     Args:
-        problem: The problem.
-        robot: Its robot.
+        robot: The robot.
+        obstacles: The boxes of the world.
+        object_size: Edge lengths of the held object [m], or None.
 
     Attributes:
         robot: The robot.
@@ -32,18 +34,23 @@ class World:
         ddq: Joint accelerations [rad/s^2], shape (n,).
     """
 
-    def __init__(self, problem: "Problem", robot: "Robot") -> None:
+    def __init__(
+        self,
+        robot: "Robot",
+        obstacles: "Sequence[Obstacle]" = (),
+        object_size: tuple[float, float, float] | None = None,
+    ) -> None:
         self.robot = robot
         self._model = robot.model
         self._data = self._model.createData()
         self._dynamics_data = self._model.createData()  # RNEA's accelerations include gravity: kept apart
         self._tip = self._model.getFrameId(robot.tip)
-        self._object_size = None if problem.object is None else problem.object.size
-        self._scene = Scene(problem.obstacle, self._object_size, len(robot.skeleton))
+        self._object_size = object_size
+        self._scene = Scene(obstacles, object_size, len(robot.skeleton))
         self._skeleton = robot.skeleton
         self._joints = sorted({point for segment in robot.skeleton for point in segment} - {robot.n})
         zero = np.zeros(robot.n)
-        self.set_state(robot.base, zero, zero, np.zeros(len(problem.obstacle)))
+        self.set_state(robot.base, zero, zero, np.zeros(len(obstacles)))
 
     def set_state(self, q: Array, dq: Array, ddq: Array, tops: Array) -> None:
         """Move to a state.

@@ -79,7 +79,7 @@ class Judge:
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
         self._problem, self._robot, self._step = problem, robot, step
-        self._world = PathWorld(problem, robot)
+        self._world = PathWorld(robot, problem.obstacle, problem.object_size)
 
     def __call__(
         self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, brief: bool = False

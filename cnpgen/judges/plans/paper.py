@@ -85,7 +85,7 @@ def _is_on_table(table: Table, tip: Array) -> bool:
 
 
 def _is_clear(problem: "Problem", world: "PathWorld", tops: Array) -> bool:
-    size = np.zeros(3) if problem.object is None else np.array(problem.object.size)
+    size = np.array(problem.object_size or (0.0, 0.0, 0.0))
     centre, reach = world.tip_position, np.linalg.norm(size) / 2
     for box, top in zip(problem.obstacle, tops, strict=True):
         low = np.array([box.x.low, box.y.low, -np.inf if box.height is None else top - box.height])[:, None]

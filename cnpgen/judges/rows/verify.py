@@ -62,7 +62,7 @@ def verify_rows(
     """
     values = _read(columns, robot.n)
     rows = len(values["start_q"])
-    world = World(problem, robot)
+    world = World(robot, problem.obstacle, problem.object_size)
     slices = [slice(first, first + BLOCK) for first in range(0, max(rows, 1), BLOCK)]
     blocks = ({name: column[part] for name, column in values.items()} for part in slices)
     with np.errstate(over="ignore", invalid="ignore"):  # what is too large to compute with becomes inf or nan: it fails

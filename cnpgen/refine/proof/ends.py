@@ -35,7 +35,7 @@ def end_mistakes(
         start_xyz: Position of the tip at the start [m], shape (3,).
         goal_xyz: Position of the tip at the goal [m], shape (3,).
     """
-    world, tops = World(problem, robot), obstacle_tops(problem, start_xyz, goal_xyz)
+    world, tops = World(robot, problem.obstacle, problem.object_size), obstacle_tops(problem, start_xyz, goal_xyz)
     goal_ddq = np.zeros(robot.n) if boundary.goal_ddq is None else boundary.goal_ddq[0]
     ends = {
         "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),

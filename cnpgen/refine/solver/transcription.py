@@ -2,8 +2,8 @@
 
 Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
 by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix
-A). Residuals are the problem's constraints, each divided by a natural size (``cnpgen.refine.solver.residuals``), so that a
-violation of 1e-3 means about the same everywhere.
+A). Residuals are the problem's constraints, each divided by a natural size (``cnpgen.refine.solver.residuals``), so
+that a violation of 1e-3 means about the same everywhere.
 """
 
 from collections.abc import Callable
