@@ -18,7 +18,7 @@ from cnpgen.cli.describe import kind_name
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round, Stage, Work
 
 PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object")
 BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition
@@ -38,10 +38,10 @@ class StageTime:
     entered: int = 0
     left: int = 0
 
-    def timed(self, run: Run) -> Run:
+    def timed(self, run: Work) -> Work:
         """Wrap the stage's function."""
 
-        def timed(batch: Batch, random: Any) -> None:
+        def timed(batch: Round, random: Any) -> None:
             self.entered += len(batch.alive)
             start = time.process_time()
             run(batch, random)

@@ -33,7 +33,7 @@ from pinocchio_scipy import (
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Batch
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
 
 LOSS = 1e-6  # an objective this much below the reference's is a defeat
 
@@ -88,7 +88,7 @@ class Comparison:
             self.lost.append({"what": what, "ours": ours, "theirs": theirs, **plain})
 
 
-def our_rows(prepared: PreparedPipeline, samples: int, seed: int) -> Batch:
+def our_rows(prepared: PreparedPipeline, samples: int, seed: int) -> Round:
     """Run rounds of draws until one has enough rows; it also holds the columns that are not stored, such as guesses."""
     size = max(256, 3 * samples)
     while True:

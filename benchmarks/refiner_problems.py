@@ -13,7 +13,7 @@ from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem, record_problem
 from cnpgen.refine.engine import prepare, tasks_of
@@ -98,7 +98,7 @@ def grid_of_hits() -> Plans:
     context = PreparedPipeline(pipeline, backend=backend, cache_folder=cache_folder).context
     puck = np.stack(np.meshgrid(PUCKS_X, PUCKS_Y, indexing="ij")).reshape(2, -1)
     along = (GOAL[:, None] - puck) / np.linalg.norm(GOAL[:, None] - puck, axis=0)
-    batch, base = Batch(puck.shape[1]), context.robot.base
+    batch, base = Round(puck.shape[1]), context.robot.base
     height = next(each.z for each in context.problem.constraint if hasattr(each, "start_band"))
     batch["goal_xyz"] = np.vstack([puck - BEHIND * along, np.full(batch.size, height)])
     batch["hit_angle"] = np.arctan2(along[1], along[0])[None]

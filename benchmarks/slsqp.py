@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.transcription import Linearisation, Transcription
 from cnpgen.refine.task import Task
 
 Array = NDArray[np.float64]
@@ -33,13 +33,13 @@ class Function:
     motion: Transcription
     bounds: Bounds
     until: float
-    at: Evaluation | None = None
+    at: Linearisation | None = None
 
     def __post_init__(self) -> None:
         self.above = np.nonzero(np.isfinite(self.bounds.upper))
         self.below = np.nonzero(np.isfinite(self.bounds.lower))
 
-    def evaluate(self, x: Array) -> Evaluation:
+    def evaluate(self, x: Array) -> Linearisation:
         """Evaluate, or remember.
 
         Raises:

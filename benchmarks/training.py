@@ -26,10 +26,10 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.requests import problem_of, read_rows
+from cnpgen.planner.requests import read_rows, record_of
 from cnpgen.refine.plans import refine_plans
 from cnpgen.training import step as parts
-from cnpgen.training.data import open_source
+from cnpgen.training.data import open_training_data
 from cnpgen.training.prepare import begin_run, prepare_run
 from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.train import train_model
@@ -75,8 +75,8 @@ class Clock:
 def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: str) -> dict[str, Any]:
     """Time steps of one network: milliseconds, and the share of every part."""
     settings = TrainingSettings(hidden=hidden, batch_size=batch)
-    source, clock, times = open_source(folder), Clock({}), []
-    with one_thread(), surroundings(problem_of(source.dataset.plan), backend) as given:
+    source, clock, times = open_training_data(folder), Clock({}), []
+    with one_thread(), surroundings(record_of(source.dataset.blueprint), backend) as given:
         run, _ = prepare_run(source, given, settings, check_rows=1)
         state = begin_run(run, Length(steps=10**6))
         gradient = np.empty_like(state.adam.parameters)

@@ -1,11 +1,11 @@
 """What packages with stages and constraints of their own import: these names stay here, wherever their modules are."""
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Batch, Stage
+from cnpgen.pipelines.stages.stage import Round, Stage
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.state import World
 
-__all__ = ["Batch", "Condition", "Constraint", "Context", "Field", "Range", "Stage", "SymbolicState", "World", "field"]
+__all__ = ["Condition", "Constraint", "Context", "Field", "Range", "Round", "Stage", "SymbolicState", "World", "field"]

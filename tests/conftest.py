@@ -25,7 +25,7 @@ from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.robots.robot import Robot
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
@@ -83,9 +83,9 @@ def kernels_of(cache_folder: Path) -> Callable[..., KernelLibrary]:
     return library
 
 
-def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> Batch:
+def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> Round:
     """Run one round of draws through the stages, up to and including the first one of class ``until``."""
-    batch, random = Batch(size), random_generator(seed, "train", 0)
+    batch, random = Round(size), random_generator(seed, "train", 0)
     for stage in prepared.pipeline.stage:
         stage.prepare(prepared.context)(batch, random)
         if type(stage).__name__ == until:

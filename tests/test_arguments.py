@@ -10,9 +10,9 @@ from conftest import tiny_recipe
 from tiny_datasets import make_tiny
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.blueprint import plan_dataset
+from cnpgen.make.blueprint import draw_up
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import dataset_recipe_of
+from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.schema.arguments import flag, integer, number
@@ -72,7 +72,7 @@ def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothi
 
 def test_whole_numbers_of_numpy_make_the_plan_of_python_s() -> None:
     recipe = tiny_recipe("airhockey-hit")
-    plans = [plan_dataset(recipe, n=kind(50), seed=kind(3), shard_size=kind(20)).plan for kind in (int, np.int64)]
+    plans = [draw_up(recipe, n=kind(50), seed=kind(3), shard_size=kind(20)).blueprint for kind in (int, np.int64)]
     assert plans[0].fingerprint == plans[1].fingerprint
 
 
@@ -91,15 +91,15 @@ def test_what_is_no_recipe_is_refused_with_what_is_one(tmp_path: Path, recipe: A
 def test_a_pipeline_is_refused_with_the_dataset_recipe_to_make_of_it() -> None:
     pipeline = load_pipeline("airhockey-hit")
     with pytest.raises(UsageError, match=r"got a Pipeline: make DatasetRecipe\(name='airhockey-hit', pipeline="):
-        dataset_recipe_of(pipeline)
+        as_dataset_recipe(pipeline)
     recipe = DatasetRecipe(name="airhockey-hit", pipeline=pipeline, splits={"train": 1000})
-    assert dataset_recipe_of(recipe) is recipe
+    assert as_dataset_recipe(recipe) is recipe
 
 
 @pytest.mark.parametrize(("splits", "said"), [({}, "has no splits"), ({"train": 9.5}, "split 'train' must be an int")])
 def test_splits_that_no_file_could_have_are_refused(splits: Any, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        plan_dataset(replace(tiny_recipe("airhockey-hit"), splits=splits), n=50)
+        draw_up(replace(tiny_recipe("airhockey-hit"), splits=splits), n=50)
 
 
 @pytest.mark.parametrize("regenerate", [1.5, "1", True, -1])

@@ -24,7 +24,7 @@ from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.make.blueprint import MAX_ROWS
 from cnpgen.store.check import Finding
-from cnpgen.store.outcome import Outcome
+from cnpgen.store.outcome import Fates
 from cnpgen.validate.dataset import ValidationReport
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
@@ -227,7 +227,7 @@ def test_quiet_is_quiet(run, hits):
 
 
 def test_reasons_that_round_to_nothing_are_not_summed_up():
-    outcome = Outcome(tried=10_000, accepted=7_996, rejections={"too close": 2_000, "rare": 4, "never": 0})
+    outcome = Fates(tried=10_000, accepted=7_996, rejections={"too close": 2_000, "rare": 4, "never": 0})
     assert _yield(outcome) == "accepted 80.0% of 10,000 draws; rejected: too close 20.0%"
 
 
@@ -384,9 +384,9 @@ def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(mon
     monkeypatch.setenv("COLUMNS", "120")
     meter = Meter()
     meter.begin("making x", 300, 100)
-    meter(100, Outcome(tried=200, accepted=100, rejections={"no": 100}))
+    meter(100, Fates(tried=200, accepted=100, rejections={"no": 100}))
     time.sleep(0.2)  # tqdm draws ten times a second
-    meter(100, Outcome(tried=100, accepted=100))
+    meter(100, Fates(tried=100, accepted=100))
     meter.close()
     assert "100/300" in terminal.getvalue()
     assert "300/300" in terminal.getvalue()

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from cnpgen.store.blueprint import load_plan
+from cnpgen.store.blueprint import load_blueprint
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import finalize
@@ -15,7 +15,7 @@ from cnpgen.validate.documents import check_recipe, check_statistics
 
 
 def test_the_recipe_in_a_plan_must_be_the_one_whose_digest_is_recorded(damaged):
-    plan = load_plan(damaged)
+    plan = load_blueprint(damaged)
     assert check_recipe(plan) == []
     changed = json.loads(json.dumps(plan.recipe))
     changed["pipeline"]["stage"][0]["min_distance"] = 0.11
@@ -31,12 +31,12 @@ def test_the_recipe_in_a_plan_must_be_the_one_whose_digest_is_recorded(damaged):
 
 @pytest.mark.parametrize("recipe", [{}, {"pipeline": 3}, {"pipeline": {"problem": {}}}])
 def test_a_plan_without_a_recipe_is_a_finding(damaged, recipe):
-    (finding,) = check_recipe(replace(load_plan(damaged), recipe=recipe))
+    (finding,) = check_recipe(replace(load_blueprint(damaged), recipe=recipe))
     assert "has no recipe" in finding.problem
 
 
 def test_statistics_must_sum_up_the_records_of_the_shards(damaged):
-    plan = load_plan(damaged)
+    plan = load_blueprint(damaged)
     assert check_statistics(damaged, plan) == []
     document = load_document(damaged / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION)
     document["splits"]["train"]["start_q"]["mean"][0] += 1e-9

@@ -9,7 +9,7 @@ from conftest import Prepare
 
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_newton import objective
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 
 CASES = json.loads((Path(__file__).parent / "data" / "hitting_configurations.json").read_text())
 
@@ -20,7 +20,7 @@ def test_where_there_are_two_local_optima_the_better_hitting_configuration_is_fo
 ) -> None:
     prepared = prepare("airhockey-replan")
     (stage,) = (each for each in prepared.pipeline.stage if isinstance(each, HittingConfiguration))
-    batch = Batch(1)
+    batch = Round(1)
     for name in ("start_q", "goal_xyz"):
         batch[name] = np.array(case[name])[:, None]
     direction = np.array(case["direction"])[:, None]

@@ -12,7 +12,7 @@ import pytest
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.store.inspection import inspect_dataset
-from cnpgen.store.outcome import DensityMap, Outcome
+from cnpgen.store.outcome import DensityMap, Fates
 from cnpgen.store.plot import plot_dataset
 from cnpgen.store.reader import open_dataset
 
@@ -68,9 +68,9 @@ def test_the_json_form_has_everything(hits):
     content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert content["complete"] is True
     assert content["rows"]["train"] == {"planned": 182, "stored": 182}
-    assert [item["name"] for item in content["fields"]] == [field.name for field in found.plan.fields]
+    assert [item["name"] for item in content["fields"]] == [field.name for field in found.blueprint.fields]
     assert len(content["fields"][0]["mean"]) == 6
-    assert content["seed"] == str(found.plan.seed)
+    assert content["seed"] == str(found.blueprint.seed)
     assert content["environments"][0]["numpy"] == np.__version__
     density = content["densities"]["goal_xyz"]
     assert np.sum(density["drawn"]) == content["yield"]["tried"]
@@ -157,7 +157,7 @@ def test_an_unfinished_dataset_is_drawn(unfinished, tmp_path):
 def test_a_density_map_over_a_single_point_is_drawn(hits, tmp_path, monkeypatch):
     found = inspect_dataset(hits)
     density = DensityMap((0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64))
-    monkeypatch.setitem(vars(found.summary), "outcome", Outcome(tried=0, accepted=0, densities={"start_xyz": density}))
+    monkeypatch.setitem(vars(found.summary), "outcome", Fates(tried=0, accepted=0, densities={"start_xyz": density}))
     plot_dataset(found, tmp_path / "point.png")
     assert (tmp_path / "point.png").exists()
 

@@ -18,16 +18,16 @@ from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import BLOCK, InterpretedGridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.mapped import MappedGridKernel
-from cnpgen.kernels.tape import Axes, Grid, Loop, Tape, tape_from_function
+from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
 
 Array = np.ndarray
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 DTYPES = ["float64", "float32"]
 AXES: tuple[Axes, ...] = ("point", "lane", "node", "fixed")
-GRID = Grid(AXES, ("point", "lane"))
+GRID = GridSpec(AXES, ("point", "lane"))
 
 
-def kernel_of(function: ca.Function, grid: Grid, *, backend: str, dtype: str, folder: Path) -> GridKernel:
+def kernel_of(function: ca.Function, grid: GridSpec, *, backend: str, dtype: str, folder: Path) -> GridKernel:
     tape = tape_from_function(function, grid=grid, dtype=dtype)  # type: ignore[arg-type]
     if backend == "casadi":
         return MappedGridKernel(tape, function)
@@ -124,8 +124,8 @@ def test_a_missing_argument_is_refused(mixed, cache_folder, backend):
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
-        (Grid(("point",), ("point", "lane")), "must name 4 arguments and 2 results, got 1 and 2"),
-        (Grid(AXES, ("point", "node")), "results of a grid are per point or per lane"),
+        (GridSpec(("point",), ("point", "lane")), "must name 4 arguments and 2 results, got 1 and 2"),
+        (GridSpec(AXES, ("point", "node")), "results of a grid are per point or per lane"),
     ],
 )
 def test_a_grid_that_is_not_about_the_function_is_refused(mixed, grid, message):
@@ -159,7 +159,7 @@ def summing(*, factor: float) -> ca.Function:
 def test_a_library_loads_grid_kernels_for_every_type(tmp_path, backend):
     library = KernelLibrary(backend, tmp_path, "problem")
     for dtype, factor in itertools.product(DTYPES, [2.0, 3.0]):
-        kernel = library.load_grid(summing, Grid(("point",), ("lane",)), dtype=dtype, factor=factor)
+        kernel = library.load_grid(summing, GridSpec(("point",), ("lane",)), dtype=dtype, factor=factor)
         out = np.zeros((1, 4), dtype)
         kernel(np.ones((1, 5, 4), dtype), out=[out])
         assert (out == 5 * factor).all()
@@ -197,7 +197,7 @@ def test_operations_in_float32_do_what_ieee_754_says(single_operations, single_o
 def single_operations(cache_folder: Path) -> dict[str, GridKernel]:
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     function = ca.Function("singles", [a, b], [f(a) for f in UNARY.values()] + [f(a, b) for f in BINARY.values()])
-    grid = Grid(("point", "point"), ("point",) * function.n_out())
+    grid = GridSpec(("point", "point"), ("point",) * function.n_out())
     return {
         backend: kernel_of(function, grid, backend=backend, dtype="float32", folder=cache_folder)
         for backend in ["numpy", *(["compiled"] if find_compiler() else [])]
@@ -225,7 +225,7 @@ def unary(name: str, dtype: str, folder: Path, x: Array) -> list[Array]:
     """Evaluate sine and cosine, or the exponential, compiled."""
     symbol = ca.SX.sym("x")
     results = [ca.exp(symbol)] if name == "exp" else [ca.sin(symbol), ca.cos(symbol)]
-    grid = Grid(("point",), ("point",) * len(results))
+    grid = GridSpec(("point",), ("point",) * len(results))
     kernel = kernel_of(ca.Function(name, [symbol], results), grid, backend="compiled", dtype=dtype, folder=folder)
     out = [np.zeros((1, 1, len(x)), dtype) for _ in results]
     kernel(x[None, None], out=out)
@@ -262,7 +262,7 @@ def test_minima_and_maxima_with_a_number_ignore_a_nan_though_they_are_one_instru
     x, bound = ca.SX.sym("x"), ca.SX.sym("bound")
     clipped = ca.fmin(ca.fmax(x, bound), 2.0)
     function = ca.Function("clipped", [x, bound], [clipped, ca.fmax(x, -x)])
-    grid = Grid(("point", "fixed"), ("point", "point"))
+    grid = GridSpec(("point", "fixed"), ("point", "point"))
     tape = tape_from_function(function, grid=grid, dtype=dtype)
     assert emit(tape).count("larger(") - emit(tape).count("v larger(") > 0
     kernel = CompiledGridKernel(tape, compile_tape(tape, cache_folder))

@@ -181,7 +181,7 @@ def test_a_shard_that_is_not_whole_is_noticed_when_the_dataset_is_opened(copy: P
     dataset = load_dataset(copy, allow_incomplete=True)
     assert dataset.splits == {"train": 18, "validation": 10}
     assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [list(range(32, 50))]
-    assert dataset.fingerprint != load_dataset(copy, allow_incomplete=True).plan.fingerprint
+    assert dataset.fingerprint != load_dataset(copy, allow_incomplete=True).blueprint.fingerprint
 
 
 def test_a_changed_byte_among_the_numbers_is_noticed_when_the_shard_is_read(copy: Path) -> None:
@@ -233,4 +233,4 @@ def test_another_dataset_has_another_fingerprint(dataset: Dataset, tmp_path: Pat
     again = load_dataset(make(tmp_path / "again"))
     other = load_dataset(make(tmp_path / "other", seed=3))
     assert dataset.fingerprint == again.fingerprint != other.fingerprint
-    assert replace(PLAN, seed=3).fingerprint == other.plan.fingerprint
+    assert replace(PLAN, seed=3).fingerprint == other.blueprint.fingerprint

@@ -13,7 +13,7 @@ from example_plans import PROBLEMS, ROBOTS
 from test_symbolic import HIGH, LOW, box_bounds, coal_segment_separation, segments
 
 from cnpgen.kernels.interpreted import InterpretedGridKernel
-from cnpgen.kernels.tape import Grid, tape_from_function
+from cnpgen.kernels.tape import GridSpec, tape_from_function
 from cnpgen.losses.integrand import HeldState
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import constraint_term
@@ -103,7 +103,7 @@ def test_the_gradient_with_the_nearest_point_held_is_that_of_finite_differences(
 def test_a_segment_exactly_along_an_axis_in_the_middle_of_a_box_has_its_depth_and_a_gradient(signed, axis, dtype):
     ends = np.repeat((LOW + HIGH)[None] / 2, 2, axis=0)
     ends[:, axis] += [-0.05, 0.02]
-    grid = Grid(("point",), ("point",))
+    grid = GridSpec(("point",), ("point",))
     found = {}
     for name in ("distance", "gradient"):
         kernel = InterpretedGridKernel(tape_from_function(signed[name], grid=grid, dtype=dtype))

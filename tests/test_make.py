@@ -15,17 +15,17 @@ from tiny_datasets import SHARDS, digests, make_tiny, snapshot
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make import shards as make
-from cnpgen.make.blueprint import plan_dataset
+from cnpgen.make.blueprint import draw_up
 from cnpgen.make.dataset import _part as make_part
 from cnpgen.make.dataset import is_quick, make_dataset, runs
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.shards import Job, make_shards, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
-from cnpgen.store.blueprint import load_plan, shards
+from cnpgen.store.blueprint import load_blueprint, shards
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.outcome import Outcome
+from cnpgen.store.outcome import Fates
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import open_workspace
 from cnpgen.validate.dataset import validate_dataset
@@ -72,7 +72,7 @@ def test_rows_do_not_depend_on_the_size_of_the_shards(large, tmp_path, size):
 
 def test_fewer_rows_are_the_first_of_each_split(large, tmp_path):
     make_dataset("airhockey-replan", tmp_path / "few", n=1000, workers=1)
-    assert load_plan(tmp_path / "few").splits == {"train": 934, "validation": 66}
+    assert load_blueprint(tmp_path / "few").splits == {"train": 934, "validation": 66}
     for split, rows in (("train", 934), ("validation", 66)):
         few, many = columns_of(tmp_path / "few", split), columns_of(large, split)
         for name, values in few.items():
@@ -103,7 +103,7 @@ def test_a_pipeline_without_a_dataset_recipe_can_be_made(tmp_path):
     from cnpgen.make.load import find_recipe
 
     as_pipeline = make_dataset(find_recipe("pipeline", "airhockey-hit"), tmp_path / "b", n=50, workers=1)
-    assert as_pipeline.plan.splits == {"train": 45, "validation": 5}
+    assert as_pipeline.blueprint.splits == {"train": 45, "validation": 5}
     assert made.complete
     assert as_pipeline.complete
 
@@ -115,13 +115,13 @@ def test_the_default_folder_is_named_after_the_dataset_and_its_major_version(tmp
 
 
 def test_planning_writes_nothing(tmp_path):
-    job = plan_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out")
-    assert sum(job.plan.splits.values()) == 660
+    job = draw_up(tiny_recipe("airhockey-hit"), tmp_path / "out")
+    assert sum(job.blueprint.splits.values()) == 660
     assert list(tmp_path.iterdir()) == []
 
 
 def test_progress_is_told_of_every_shard_and_its_draws(tmp_path):
-    seen: list[tuple[int, Outcome]] = []
+    seen: list[tuple[int, Fates]] = []
     begun: list[tuple[str, Path, int, int]] = []
     make_tiny(tmp_path / "out", progress=lambda *x: seen.append(x), begin=lambda *x: begun.append(x))
     assert [rows for rows, _ in seen] == [250, 250, 100, 60]
@@ -154,7 +154,7 @@ def test_all_parts_of_a_job_array_make_the_dataset_and_the_last_one_finishes_it(
 
 @pytest.mark.parametrize("m", [1, 2, 3, 5, 8])
 def test_parts_share_no_shard_and_leave_none(job, m):
-    tasks = shards(job.plan)
+    tasks = shards(job.blueprint)
     parts = [make_part(tasks, (k, m)) for k in range(m)]
     assert [task for part in parts for task in part] == tasks
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
@@ -202,25 +202,25 @@ def test_the_worst_violation_of_every_check_is_recorded(tiny):
 @pytest.fixture(scope="module")
 def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job") / "out"
-    job = plan_dataset(tiny_recipe("airhockey-hit"), folder, shard_size=TINY_SHARD)
-    open_workspace(job.folder, job.plan)
+    job = draw_up(tiny_recipe("airhockey-hit"), folder, shard_size=TINY_SHARD)
+    open_workspace(job.folder, job.blueprint)
     return job
 
 
 def test_making_a_shard_twice_is_harmless(job):
-    task = shards(job.plan)[1]
+    task = shards(job.blueprint)[1]
     (first,) = make_shards(job, [task])
     before = (job.folder / task.file).read_bytes()
     (second,) = make_shards(job, [task])
     assert (job.folder / task.file).read_bytes() == before
     assert first[0] == second[0] == 250
-    assert task not in pending(job.folder, job.plan)
+    assert task not in pending(job.folder, job.blueprint)
 
 
 def test_shards_are_the_rows_of_their_blocks_made_together_or_with_gaps(job):
     backend, cache = choose_backend()
     prepared = PreparedPipeline(job.pipeline, backend=backend, cache_folder=cache)
-    plan = replace(job.plan, splits={"train": 3 * BLOCK_ROWS}, shard_size=1900)
+    plan = replace(job.blueprint, splits={"train": 3 * BLOCK_ROWS}, shard_size=1900)
     blocks = [prepared.block(plan.seed, "train", index) for index in range(3)]
     tasks = [task for task in shards(plan) if task.index != 3]
     assert {task.first_row // BLOCK_ROWS for task in tasks} == {0, 1, 2}
@@ -266,7 +266,7 @@ def test_small_shards_have_the_rows_and_counts_of_large_ones(large, tmp_path):
 
 
 def test_a_second_process_is_started_for_many_rows_or_slow_ones_only(job):
-    plan = replace(job.plan, backend="compiled", splits={"train": 200_000})
+    plan = replace(job.blueprint, backend="compiled", splits={"train": 200_000})
     assert is_quick(plan, shards(plan))
     assert not is_quick(replace(plan, backend="numpy"), shards(plan))
     assert not is_quick(replace(plan, block_rows=64), shards(plan)[:1])
@@ -277,7 +277,7 @@ def test_a_second_process_is_started_for_many_rows_or_slow_ones_only(job):
 @pytest.mark.parametrize("size", [64, 1000, 4096, 5000, 8192, 100_000])
 @pytest.mark.parametrize("workers", [1, 2, 16])
 def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size, workers):
-    plan = replace(job.plan, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
+    plan = replace(job.blueprint, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
     tasks = shards(plan)
     groups = runs(plan, tasks, workers)
     assert [task for group in groups for task in group] == tasks
@@ -292,7 +292,7 @@ def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size,
 
 
 def test_the_plan_says_what_the_rows_came_from(tiny):
-    plan = load_plan(tiny("airhockey-replan"))
+    plan = load_blueprint(tiny("airhockey-replan"))
     assert (tiny("airhockey-replan") / PLAN).is_file()
     assert plan.recipe["pipeline"]["name"] == "airhockey-replan"
     assert plan.robot["joint_names"] == [f"joint_{k}" for k in range(1, 7)]

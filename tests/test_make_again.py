@@ -11,7 +11,7 @@ from tiny_datasets import digests, flip, make_tiny, snapshot
 
 from cnpgen.make.dataset import make_dataset
 from cnpgen.store import mending
-from cnpgen.store.blueprint import load_plan, shards
+from cnpgen.store.blueprint import load_blueprint, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
 from cnpgen.validate.dataset import validate_dataset
@@ -56,7 +56,7 @@ def test_a_truncated_shard_is_noticed_and_made_good(tiny, folder, size):
 
 
 def test_several_damaged_shards_are_one_line(tiny, folder):
-    for task in shards(load_plan(folder))[1:]:
+    for task in shards(load_blueprint(folder))[1:]:
         flip(folder / task.file)
     with pytest.warns(RuntimeWarning, match=r"^3 shards are damaged and are made again: .*shard-00001.h5 was changed"):
         made = make_tiny(folder)
@@ -159,7 +159,7 @@ def test_whoever_watches_is_told_of_the_comparison_and_then_of_the_making(folder
 
 
 def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_rest(folder, monkeypatch):
-    plan = load_plan(folder)
+    plan = load_blueprint(folder)
     tasks = shards(plan) * 200
     compared = []
     check = mending.check_committed
@@ -178,5 +178,5 @@ def test_shard_size_and_backend_of_an_unfinished_dataset_are_kept(tmp_path):
     make_dataset(recipe, tmp_path, shard_size=77, backend="numpy", workers=1, part=(0, 2))
     made = make_dataset(recipe, tmp_path, workers=1)
     assert made.complete
-    assert (made.plan.shard_size, made.plan.backend) == (77, "numpy")
+    assert (made.blueprint.shard_size, made.blueprint.backend) == (77, "numpy")
     assert load_manifest(tmp_path)["shard_size"] == 77

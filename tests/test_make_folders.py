@@ -16,7 +16,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.blueprint import load_plan
+from cnpgen.store.blueprint import load_blueprint
 from cnpgen.validate.dataset import validate_dataset
 
 
@@ -36,7 +36,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_another_dataset_in_the_folder_is_refused_and_not_touched(folder, what):
-    if CHANGES[what] == {"backend": load_plan(folder).backend}:
+    if CHANGES[what] == {"backend": load_blueprint(folder).backend}:
         pytest.skip("this is the only backend here")
     before = snapshot(folder)
     words = what.replace("_", " ")
@@ -109,7 +109,7 @@ def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_correct
     monkeypatch.undo()
     assert (tmp_path / "out" / "plan.json").is_file()
     assert make_tiny(tmp_path / "out", seed=2).complete
-    assert load_plan(tmp_path / "out").seed == 2
+    assert load_blueprint(tmp_path / "out").seed == 2
     assert validate_dataset(tmp_path / "out").ok
 
 
@@ -258,7 +258,7 @@ def test_a_place_that_the_system_does_not_give_is_a_machine_error(capsys):
 
 def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)  # root may write everywhere
-    monkeypatch.setattr("cnpgen.make.dataset.plan_dataset", None)
+    monkeypatch.setattr("cnpgen.make.dataset.draw_up", None)
     code, line = refused(capsys, str(tmp_path / "new"))
     assert code == 3
     assert line.endswith("new: Permission denied; choose a folder that you may write to")

@@ -21,7 +21,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.outcome import Outcome
+from cnpgen.store.outcome import Fates
 from cnpgen.validate.dataset import validate_dataset
 
 ROOT = Path(__file__).parents[1]
@@ -41,7 +41,7 @@ def times(folder: Path) -> dict[str, int]:
 def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, workers, error):
     folder = tmp_path / "out"
 
-    def interrupt(_rows: int, _outcome: Outcome | None) -> None:
+    def interrupt(_rows: int, _outcome: Fates | None) -> None:
         raise error
 
     with pytest.raises(error):
@@ -105,7 +105,7 @@ def test_a_killed_run_is_finished_with_the_same_bytes(tiny, tmp_path, workers):
 def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
     killed: list[int] = []
 
-    def kill(_rows: int, _outcome: Outcome | None) -> None:
+    def kill(_rows: int, _outcome: Fates | None) -> None:
         if not killed:
             names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in descendants(os.getpid())}
             killed.extend(pid for pid, name in names.items() if "popen_loky" in name)
@@ -173,7 +173,7 @@ def test_a_disk_that_is_really_full_loses_nothing(tiny, small_disk):
 def test_another_dataset_in_the_same_folder_meanwhile_stops_the_first(tmp_path):
     folder = tmp_path / "out"
 
-    def replace_it(_rows: int, _outcome: Outcome | None) -> None:
+    def replace_it(_rows: int, _outcome: Fates | None) -> None:
         make_dataset(tiny_recipe("airhockey-replan"), folder, shard_size=400, workers=1, force=True)
 
     with pytest.raises(UsageError, match="was given to another dataset while this one was made"):

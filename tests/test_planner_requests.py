@@ -15,7 +15,7 @@ from cnpgen.loader.load import load_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.request_files import read_file
 from cnpgen.planner.requests import read_rows
-from cnpgen.training.data import open_source, stages_of
+from cnpgen.training.data import open_training_data, stages_of
 
 Tiny = Callable[[str], Path]
 
@@ -24,8 +24,8 @@ Tiny = Callable[[str], Path]
 def model(tiny: Tiny) -> Model:
     """A model of the replans that knows how its rows were drawn."""
     folder = tiny("airhockey-replan")
-    dataset = open_source(folder).describe()
-    training = {"dataset": dataset, "stages": stages_of(load_dataset(folder).plan)}
+    dataset = open_training_data(folder).describe()
+    training = {"dataset": dataset, "stages": stages_of(load_dataset(folder).blueprint)}
     return untrained_model("airhockey", boundary_of_columns(columns_of(folder), 20), training=training)
 
 

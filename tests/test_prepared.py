@@ -11,9 +11,9 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Batch
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import Outcome, merge_outcomes
+from cnpgen.store.outcome import Fates, merge_fates
 
 CLOSE = 1e-9  # SI: what backends may differ by
 SEED = 20261121
@@ -35,7 +35,7 @@ def assert_same_columns(found: dict[str, np.ndarray], expected: dict[str, np.nda
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def assert_same_outcome(found: Outcome, expected: Outcome) -> None:
+def assert_same_outcome(found: Fates, expected: Fates) -> None:
     assert (found.tried, found.accepted) == (expected.tried, expected.accepted)
     assert dict(found.rejections) == dict(expected.rejections)
     for name, density in expected.densities.items():
@@ -57,14 +57,14 @@ def test_blocks_of_another_seed_split_or_index_share_no_row(prepared, whole, oth
     np.testing.assert_array_equal(columns["sample_id"], [np.arange(first, first + 500)])
 
 
-def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple[dict[str, np.ndarray], Outcome]:
+def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple[dict[str, np.ndarray], Fates]:
     """Make a block piece by piece."""
     made = [
         prepared.block(SEED, "train", index, first=first, stop=stop)
         for first, stop in zip([0, *cuts], [*cuts, BLOCK_ROWS], strict=True)
     ]
     columns = {name: np.concatenate([part.columns[name] for part in made], axis=1) for name in made[0].columns}
-    return columns, merge_outcomes([part.outcome for part in made])
+    return columns, merge_fates([part.outcome for part in made])
 
 
 @pytest.mark.parametrize("cuts", [[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]])
@@ -94,7 +94,7 @@ def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[
     sizes, tails = [], []
     run = PreparedPipeline._round
 
-    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Batch:
+    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
         batch = run(self, random, size)
         sizes.append(len(batch.alive))
         tails.append(batch.size - 1 - int(batch.alive[-1]))
@@ -150,7 +150,7 @@ def test_attempts_count_the_draws_from_one_row_to_the_next_across_rounds(prepare
     fates: list[int] = []
     run = PreparedPipeline._round
 
-    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Batch:
+    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
         batch = run(self, random, size)
         fates.extend(batch.fate.tolist())
         return batch
@@ -185,7 +185,7 @@ def test_density_maps_count_every_draw_and_every_row(prepared, whole):
 def test_nothing_that_the_stages_pass_on_is_rejected_at_the_last_gate(prepare: Prepare, name):
     """The stages are exact: the gate is there for what nobody has thought of."""
     prepared = prepare(name)
-    outcome = merge_outcomes([prepared.block(SEED, "test", index).outcome for index in range(8)])
+    outcome = merge_fates([prepared.block(SEED, "test", index).outcome for index in range(8)])
     gate = [constraint.reason for constraint in prepared.context.problem.constraint]
     gate += ["tip not at its position", "hit not along its direction"]
     assert {reason: count for reason, count in outcome.rejections.items() if reason in gate and count} == {}
@@ -207,7 +207,7 @@ def test_a_pipeline_that_accepts_nothing_is_given_up_with_its_reasons(prepare: P
 # --- backends ---------------------------------------------------------------------------------------------------------
 
 
-def same_round(prepared: PreparedPipeline, size: int) -> Batch:
+def same_round(prepared: PreparedPipeline, size: int) -> Round:
     return prepared._round(random_generator(SEED, "train", 0), size)
 
 

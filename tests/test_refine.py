@@ -21,10 +21,10 @@ from cnpgen.refine.solver import sqp
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.quadratic import Model, choose
+from cnpgen.refine.solver.quadratic import QuadraticModel, choose
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import Settings, minimise
-from cnpgen.refine.solver.transcription import Stage, Transcription
+from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.symbolic.state import SymbolicState
 from cnpgen.trajectory.boundary import Boundary
@@ -41,7 +41,7 @@ def transcription(
 ) -> Transcription:
     kernels, spec = library(plan.problem.name), plan.problem.trajectory
     residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
-    stage = Stage(spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals)
+    stage = ResidualKernels(spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals)
     return Transcription(stage, make_grid(spec, points), boundary=boundary or plan.boundary, tops=tops(plan))
 
 
@@ -422,7 +422,7 @@ def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radiu
     motion = tool.transcription(task(plan), tool.passes.first)
     bounds = tool.bounds(task(plan), tool.passes.first, motion.end_residuals())
     at = motion.evaluate(tool.straight(task(plan)))
-    model = Model(motion, at, bounds, bounds.violation(at.g), proximal=0.02, penalty=2.0)
+    model = QuadraticModel(motion, at, bounds, bounds.violation(at.g), proximal=0.02, penalty=2.0)
     held = choose(at.g, bounds, thin=6, near=0.4, leaps=motion.leaps(at, 0.45))
     step = model.solve(held, np.full(motion.nx, radius))
     assert step is not None

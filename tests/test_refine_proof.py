@@ -18,7 +18,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.proof import table_proof
-from cnpgen.refine.proof.proof import Finding, Kind, explain_failure, explain_plans
+from cnpgen.refine.proof.proof import Explanation, Kind, explain_failure, explain_plans
 from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, joint_limits, moments
 from cnpgen.refine.proof.table_proof import table_bounds
 from cnpgen.refine.proof.tip_bound import Arm, bound_projection
@@ -27,7 +27,7 @@ from cnpgen.trajectory.boundary import Boundary
 LABELS = ("hit", "replan", "transport")
 
 
-def explain(plan: Plan, **changes: np.ndarray) -> Finding:
+def explain(plan: Plan, **changes: np.ndarray) -> Explanation:
     boundary = replace(plan.boundary, **changes)
     ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
     return explain_failure(plan.problem, plan.robot, boundary, **ends)
@@ -199,7 +199,7 @@ def test_an_end_at_rest_near_the_edge_is_not_on_the_verge() -> None:
     assert explain_case(at_the_edge(clearance=0.0005, speed=0.0)).kind is Kind.UNKNOWN
 
 
-def explain_case(plan: Plan) -> Finding:
+def explain_case(plan: Plan) -> Explanation:
     ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
     return explain_failure(plan.problem, plan.robot, plan.boundary, **ends)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.store.blueprint import REVISION, load_plan, shards
+from cnpgen.store.blueprint import REVISION, load_blueprint, shards
 from cnpgen.validate import blocks
 from cnpgen.validate.blocks import Regeneration, make_again
 
@@ -24,7 +24,7 @@ def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def problem_of(folder: Path) -> str:
-    plan = load_plan(folder)
+    plan = load_blueprint(folder)
     found = make_again(folder, plan, shards(plan)[:1], 3)
     assert (found.made, found.blocks, found.identical) == (1, 1, 0)
     (finding,) = found.findings
@@ -42,10 +42,10 @@ def test_another_revision_of_the_generator_is_an_explanation(different, monkeypa
 
 
 def test_other_libraries_are_an_explanation(different, monkeypatch):
-    monkeypatch.setattr(blocks, "versions", lambda: {**load_plan(different).versions, "numpy": "0.1"})
+    monkeypatch.setattr(blocks, "versions", lambda: {**load_blueprint(different).versions, "numpy": "0.1"})
     assert problem_of(different).endswith(f"numpy {np.__version__} -> 0.1)")
 
 
 def test_the_same_code_makes_the_same_bits(damaged):
-    plan = load_plan(damaged)
+    plan = load_blueprint(damaged)
     assert make_again(damaged, plan, shards(plan), 2) == Regeneration(made=2, blocks=4, identical=2)

@@ -10,18 +10,18 @@ import pytest
 from conftest import SHIPPED, TINY_SHARD, tiny_recipe
 
 from cnpgen.make.dataset import make_dataset
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.record import ShardRecord, load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.store.statistics import column_statistics
 from cnpgen.validate.numbers import check_numbers
 
 Columns = dict[str, np.ndarray]
-Parts = tuple[DatasetPlan, ShardTask, Columns, ShardRecord]
+Parts = tuple[Blueprint, ShardTask, Columns, ShardRecord]
 
 
 def parts(folder: Path, index: int = 1) -> Parts:
-    plan = load_plan(folder)
+    plan = load_blueprint(folder)
     task = shards(plan)[index]
     return plan, task, read_shard(folder / task.file), load_record(folder, task)
 

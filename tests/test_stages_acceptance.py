@@ -9,26 +9,26 @@ from conftest import SHIPPED, Prepare, needs_compiler, run_stages
 
 from cnpgen.pipelines.acceptance import _unmet, acceptance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 STATES = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")]
 
 
-def judged(prepared: PreparedPipeline, batch: Batch, **changes: np.ndarray) -> Batch:
+def judged(prepared: PreparedPipeline, batch: Round, **changes: np.ndarray) -> Round:
     """Copy the survivors, change some columns and pass them through the gate."""
-    again = Batch(len(batch.alive))
+    again = Round(len(batch.alive))
     for name, values in batch.columns.items():
         again[name] = changes.get(name, values).copy()
     acceptance(prepared.context, set(batch.columns))(again, random_generator(0, "train", 0))
     return again
 
 
-def fates(batch: Batch) -> set[str]:
+def fates(batch: Round) -> set[str]:
     return {batch.reasons[k - 1] for k in set(batch.fate.tolist()) if k}
 
 
-def roomy(prepared: PreparedPipeline, batch: Batch) -> Batch:
+def roomy(prepared: PreparedPipeline, batch: Round) -> Round:
     """Keep what is not on the verge of breaking a constraint already: one small change is to break one constraint."""
     robot = prepared.context.robot
     for end in ("start", "goal"):
@@ -40,7 +40,7 @@ def roomy(prepared: PreparedPipeline, batch: Batch) -> Batch:
 
 
 @pytest.fixture(scope="module")
-def rounds(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, Batch]]:
+def rounds(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, Round]]:
     return {name: (prepare(name), roomy(prepare(name), run_stages(prepare(name), 250, seed=111))) for name in SHIPPED}
 
 

@@ -14,7 +14,7 @@ from cnpgen.make.load import find_recipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.braking import MAX_STEPS, STEP, SUSPECT, BrakingReach, braking_step, overshoot, tip_state
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.problems.constraints.table import Table
 
 Array = np.ndarray
@@ -60,14 +60,14 @@ def rollout(arm: Arm, robot, table: Table, case: Case) -> float:
 
 
 @pytest.fixture(scope="module")
-def fast(prepare: Prepare) -> tuple[PreparedPipeline, Batch]:
+def fast(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
     """Moving starts and goals of a pipeline without any reach rule."""
     prepared = prepare(without_stages(prepare("airhockey-replan").pipeline, "BallisticReach"))
     return prepared, run_stages(prepared, DRAWS, seed=81)
 
 
 @pytest.fixture(scope="module")
-def suspects(fast: tuple[PreparedPipeline, Batch]) -> list[Case]:
+def suspects(fast: tuple[PreparedPipeline, Round]) -> list[Case]:
     """States that a straight line of 80 ms carries off the table: starts, and goals reversed in time."""
     prepared, batch = fast
     table, arm = prepared.context.constraint(Table), Arm(prepared.context.robot)
@@ -126,9 +126,9 @@ def test_states_that_are_not_suspect_can_brake(fast, kernels_of, fastest):
             assert final[-1].max() <= -1e-3
 
 
-def one(prepared: PreparedPipeline, q: Array, dq: Array) -> Batch:
+def one(prepared: PreparedPipeline, q: Array, dq: Array) -> Round:
     """A batch of one draw that starts with dq and arrives at rest."""
-    batch = Batch(1)
+    batch = Round(1)
     for name, values in (("start_q", q), ("start_dq", dq), ("goal_q", q), ("goal_dq", 0 * dq)):
         batch[name] = values[:, None].copy()
     BrakingReach().prepare(prepared.context)(batch, random_generator(0, "train", 0))
@@ -157,7 +157,7 @@ def test_a_goal_is_a_start_reversed_in_time(fast):
     q, dq = batch["start_q"], batch["start_dq"]
     ends = []
     for start, goal in (("start", "goal"), ("goal", "start")):
-        moving = Batch(q.shape[1])
+        moving = Round(q.shape[1])
         moving[f"{start}_q"], moving[f"{start}_dq"] = q, dq if start == "start" else -dq
         moving[f"{goal}_q"], moving[f"{goal}_dq"] = q, 0 * dq
         BrakingReach().prepare(prepared.context)(moving, random_generator(0, "train", 0))
@@ -171,7 +171,7 @@ def test_the_margin_is_a_distance_before_the_edge(fast, kernels_of, fastest):
     table, tip, brake = kernels(prepared, fastest, kernels_of)
     excess = overshoot(tip, brake, table, batch["start_q"], batch["start_dq"], margin=0.02)
     for margin in (0.0, 1e-3, 0.02):
-        again = Batch(batch["start_q"].shape[1])
+        again = Round(batch["start_q"].shape[1])
         for name in ("start_q", "start_dq", "goal_q"):
             again[name] = batch[name]
         again["goal_dq"] = 0 * batch["goal_dq"]

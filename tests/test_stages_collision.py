@@ -10,7 +10,7 @@ from conftest import Prepare, needs_compiler, run_stages
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.collision import Collision, coal_judge, skeleton_distance
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.world.state import World
 
@@ -73,11 +73,11 @@ def test_coal_s_verdict_on_arm_and_object_agrees_with_the_verifier_s_distances(h
     np.testing.assert_array_equal(hit[clear], ((arm < RADIUS) | (held < -depth))[clear])
 
 
-def pair_at(heavy: PreparedPipeline, change: Callable[[Batch], None]) -> Batch:
+def pair_at(heavy: PreparedPipeline, change: Callable[[Round], None]) -> Round:
     """Draws that passed every stage with 6 mm to spare, changed; judged by Coal on both ends."""
     batch = run_stages(heavy, 200, seed=92)
     batch.reject((batch["start_clearance"] > 6e-3)[0] & (batch["goal_clearance"] > 6e-3)[0], "close")
-    again = Batch(len(batch.alive))
+    again = Round(len(batch.alive))
     for name in ("start_q", "goal_q", "start_xyz", "goal_xyz"):
         again[name] = batch[name].copy()
     change(again)
@@ -95,7 +95,7 @@ def test_an_object_that_stands_on_its_pedestal_is_no_collision(heavy):
 def test_an_object_may_sink_into_its_pedestal_as_deep_as_the_problem_says(heavy, end, raised, collides):
     """The pedestal's top is where the object's bottom is said to be: saying it is higher raises the pedestal."""
 
-    def change(batch: Batch) -> None:
+    def change(batch: Round) -> None:
         batch[f"{end}_xyz"][2] += raised
 
     batch = pair_at(heavy, change)

@@ -12,7 +12,7 @@ from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.draw import DrawPositions
 from cnpgen.pipelines.stages.hit_angle import wrap
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.schema.keys import Range
 
 DRAWS = 40_000
@@ -37,7 +37,7 @@ def stage_of(prepared: PreparedPipeline, kind: str):
 
 
 @pytest.fixture(scope="module", params=SHIPPED)
-def drawn(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, Batch]:
+def drawn(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, Round]:
     prepared = prepare(request.param)
     return prepared, run_stages(prepared, DRAWS, seed=11, until="DrawPositions")
 
@@ -107,7 +107,7 @@ def test_boxes_out_of_reach_are_a_mistake_in_the_recipe(prepare):
 def test_guesses_are_uniform_and_independent_in_their_box(prepare, name):
     prepared = prepare(name)
     stage = stage_of(prepared, "StartIK")
-    guess, batch = stage.guess, Batch(DRAWS)
+    guess, batch = stage.guess, Round(DRAWS)
     batch["start_xyz"] = np.zeros((3, DRAWS))
     stage.prepare(prepared.context)(batch, random_generator(13, "train", 0))
     values = batch.drawn["guess_q"]
@@ -221,7 +221,7 @@ def test_ends_at_rest_have_zero_velocity_and_acceleration(prepare, name, ends):
 
 
 def test_a_stage_s_luck_does_not_depend_on_what_an_earlier_one_rejected():
-    whole, thinned = Batch(100), Batch(100)
+    whole, thinned = Round(100), Round(100)
     random = [np.random.default_rng(21) for _ in range(2)]
     first = whole.draw(random[0], 2)
     keep = np.arange(100) % 3 != 0
@@ -231,7 +231,7 @@ def test_a_stage_s_luck_does_not_depend_on_what_an_earlier_one_rejected():
 
 
 def test_every_rejected_draw_has_one_fate_and_leaves_every_column():
-    batch = Batch(10)
+    batch = Round(10)
     batch["x"] = np.arange(10.0)[None]
     batch.reject(np.arange(10) % 2 == 0, "odd")
     batch["y"] = 2 * batch["x"]
@@ -247,7 +247,7 @@ def test_every_rejected_draw_has_one_fate_and_leaves_every_column():
 
 
 def test_columns_of_the_wrong_length_are_refused():
-    batch = Batch(4)
+    batch = Round(4)
     with pytest.raises(ValueError, match=r"column 'x' must have shape \(width, 4\), got \(2, 3\)"):
         batch["x"] = np.zeros((2, 3))
     with pytest.raises(ValueError, match="column 'x'"):
@@ -257,7 +257,7 @@ def test_columns_of_the_wrong_length_are_refused():
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_stage_works_on_a_round_without_survivors(prepare, name):
     prepared = prepare(name)
-    batch, random = Batch(64), random_generator(0, "train", 0)
+    batch, random = Round(64), random_generator(0, "train", 0)
     for stage in load_pipeline(name).stage:
         run = stage.prepare(prepared.context)
         run(batch, random)

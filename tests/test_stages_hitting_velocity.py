@@ -8,7 +8,7 @@ from conftest import Arm, Prepare, needs_compiler, run_stages
 from scipy.optimize import linprog
 
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity, hitting_velocity
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 
 Array = np.ndarray
 HALF = np.sqrt(0.5)
@@ -139,8 +139,8 @@ def test_full_speed_hits_are_at_a_limit(prepare: Prepare):
     np.testing.assert_allclose(ratio.max(0)[full], 1.0, rtol=1e-12)
 
 
-def stage_on(prepared, q: Array, angle: float) -> Batch:
-    batch = Batch(1)
+def stage_on(prepared, q: Array, angle: float) -> Round:
+    batch = Round(1)
     batch["goal_q"], batch["hit_angle"] = q[:, None].copy(), np.array([[angle]])
     HittingVelocity(full_speed=1.0).prepare(prepared.context)(batch, np.random.default_rng(0))
     return batch
@@ -159,7 +159,7 @@ def test_hits_slower_than_asked_are_rejected(prepare: Prepare):
     prepared = prepare("airhockey-hit")
     robot = prepared.context.robot
     assert len(stage_on(prepared, robot.base, 0.0).alive) == 1
-    batch = Batch(1)
+    batch = Round(1)
     batch["goal_q"], batch["hit_angle"] = robot.base[:, None].copy(), np.zeros((1, 1))
     HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(batch, np.random.default_rng(0))
     assert batch.reasons == ["no hitting velocity"]

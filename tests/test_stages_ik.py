@@ -10,14 +10,14 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, GoalIK, ik_step
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 
 EXACT = 1e-9  # m and rad
 ENDS = [("airhockey-hit", "start"), ("airhockey-replan", "start"), ("heavy-object", "start"), ("heavy-object", "goal")]
 
 
 @pytest.fixture(scope="module", params=ENDS, ids=" ".join)
-def solved(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, str, Batch]:
+def solved(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, str, Round]:
     """Enough draws for some that end with joints on their limits, where convergence is slow."""
     name, end = request.param
     until = {"start": "StartIK", "goal": "GoalIK"}[end]

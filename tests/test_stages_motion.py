@@ -10,14 +10,14 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.motion import TableAcceleration, TableVelocity, table_acceleration, table_velocity
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 
 EXACT = 1e-9  # m/s and m/s^2
 DRAWS = 2000
 
 
 @pytest.fixture(scope="module")
-def moving(prepare: Prepare) -> tuple[PreparedPipeline, Batch]:
+def moving(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
     prepared = prepare("airhockey-replan")
     return prepared, run_stages(prepared, DRAWS, seed=61)
 
@@ -73,7 +73,7 @@ def with_torque_scale(pipeline: Pipeline, scale: float) -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def weak(prepare: Prepare) -> tuple[PreparedPipeline, Batch]:
+def weak(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
     """The same arm with a fifth of its torque: enough to hold still, hardly more."""
     prepared = prepare(with_torque_scale(prepare("airhockey-replan").pipeline, 0.2), "numpy")
     return prepared, run_stages(prepared, DRAWS, seed=61)

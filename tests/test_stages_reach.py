@@ -9,14 +9,14 @@ from conftest import Arm, Prepare, run_stages, without_stages
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.prepared import random_generator
 from cnpgen.pipelines.stages.reach import BallisticReach
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.problems.constraints.table import Table
 
 
 def batch_at(
     start: tuple[float, ...], velocity: tuple[float, ...], goal: tuple[float, ...], hit: tuple[float, ...]
-) -> Batch:
-    batch = Batch(1)
+) -> Round:
+    batch = Round(1)
     batch["start_xyz"], batch["goal_xyz"] = (np.array([[*xy, 0.16]]).T for xy in (start, goal))
     batch["start_tip_velocity"] = np.array([[*velocity, 0.0]]).T
     batch["hit_angle"], batch["hit_speed"] = (np.array([[value]]) for value in hit)
@@ -90,7 +90,7 @@ def test_the_rule_rejects_exactly_the_draws_that_numpy_says_leave(prepare: Prepa
 def test_without_times_nothing_is_needed_and_nothing_rejected(prepare: Prepare):
     stage = BallisticReach()
     assert stage.needs == ()
-    batch = Batch(5)
+    batch = Round(5)
     stage.prepare(prepare("airhockey-hit").context)(batch, random_generator(0, "train", 0))
     assert batch.reasons == []
 

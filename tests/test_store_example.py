@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, save_plan, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, save_plan, shards
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import finalize
-from cnpgen.store.outcome import DensityMap, Outcome
+from cnpgen.store.outcome import DensityMap, Fates
 from cnpgen.store.record import ShardRecord, commit_shard
 
 FIELDS = (
@@ -23,7 +23,7 @@ FIELDS = (
     Field("clearance", "m", "smallest distance", role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),
     Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
 )
-PLAN = DatasetPlan(
+PLAN = Blueprint(
     name="two-shards",
     version="1.0.0",
     title='A "small" dataset: for tests',
@@ -53,9 +53,9 @@ def make_columns(task: ShardTask, dtype: str = "float64") -> dict[str, NDArray[A
     return columns | {"sample_id": np.arange(task.first_row, task.first_row + task.rows)}
 
 
-def make_outcome(task: ShardTask) -> Outcome:
+def make_outcome(task: ShardTask) -> Fates:
     density = DensityMap((0.6, 2.0), (-0.45, 0.45), np.full((4, 3), 2), np.full((4, 3), 1))
-    return Outcome(
+    return Fates(
         tried=2 * task.rows,
         accepted=task.rows,
         rejections={"no IK": task.rows - 1, "collision": 1},
@@ -64,7 +64,7 @@ def make_outcome(task: ShardTask) -> Outcome:
     )
 
 
-def make_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> ShardRecord:
+def make_shard(folder: Path, plan: Blueprint, task: ShardTask) -> ShardRecord:
     columns, outcome = make_columns(task, plan.dtype), make_outcome(task)
     return commit_shard(
         folder,
@@ -78,7 +78,7 @@ def make_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> ShardRecord:
     )
 
 
-def make_shards(folder: Path, plan: DatasetPlan = PLAN) -> None:
+def make_shards(folder: Path, plan: Blueprint = PLAN) -> None:
     save_plan(folder, plan)
     for task in shards(plan):
         make_shard(folder, plan, task)

@@ -13,10 +13,10 @@ from test_store_example import PLAN
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store.blueprint import (
-    DatasetPlan,
+    Blueprint,
     default_shard_size,
     from_json,
-    load_plan,
+    load_blueprint,
     save_plan,
     shard_attributes,
     shards,
@@ -27,7 +27,7 @@ from cnpgen.store.files.documents import save_document
 
 def test_a_plan_survives_json_disk_and_pickle(tmp_path: Path) -> None:
     save_plan(tmp_path, PLAN)
-    assert load_plan(tmp_path) == PLAN
+    assert load_blueprint(tmp_path) == PLAN
     assert from_json(json.loads(json.dumps(to_json(PLAN)))) == PLAN
     assert pickle.loads(pickle.dumps(PLAN)).fingerprint == PLAN.fingerprint
 
@@ -158,24 +158,24 @@ def test_damaged_plans_are_refused_by_name(tmp_path: Path, action: Callable[[byt
     save_plan(tmp_path, PLAN)
     damage(action, tmp_path)
     with pytest.raises(DatasetError, match=r"plan\.json is damaged"):
-        load_plan(tmp_path)
+        load_blueprint(tmp_path)
 
 
 def test_missing_newer_and_nonsensical_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="missing"):
-        load_plan(tmp_path)
+        load_blueprint(tmp_path)
     path = tmp_path / "plan.json"
     save_document(path, {"format": "cnpgen-plan", "format_version": 2})
     with pytest.raises(DatasetError, match="upgrade"):
-        load_plan(tmp_path)
+        load_blueprint(tmp_path)
     document = {"format": "cnpgen-plan", "format_version": 1, "fingerprint": PLAN.fingerprint}
     for change in ({"fields": [{}]}, {"seed": "x"}, {"splits": 3}, {"shard_size": "x"}):
         save_document(path, document | to_json(PLAN) | change)
         with pytest.raises(DatasetError, match="damaged"):
-            load_plan(tmp_path)
+            load_blueprint(tmp_path)
     save_document(path, document | to_json(PLAN) | {"backend": "other"})
     with pytest.raises(DatasetError, match="fingerprint"):
-        load_plan(tmp_path)
+        load_blueprint(tmp_path)
 
 
 def test_shard_attributes_tell_a_shard_from_its_neighbours_and_from_another_seed() -> None:
@@ -183,7 +183,7 @@ def test_shard_attributes_tell_a_shard_from_its_neighbours_and_from_another_seed
     assert first["first_sample_id"] == 0
     assert second["first_sample_id"] == 32
     assert first["root_seed"] == str(2**100 + 7)
-    other: DatasetPlan = replace(PLAN, seed=8)
+    other: Blueprint = replace(PLAN, seed=8)
     assert shard_attributes(other, shards(other)[0])["plan_fingerprint"] != first["plan_fingerprint"]
 
 

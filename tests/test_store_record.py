@@ -17,7 +17,7 @@ from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.check import check_dataset
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize
-from cnpgen.store.outcome import DensityMap, Outcome, merge_outcomes, outcome_from_json
+from cnpgen.store.outcome import DensityMap, Fates, merge_fates, outcome_from_json
 from cnpgen.store.record import (
     commit_shard,
     is_committed,
@@ -163,12 +163,12 @@ def test_outcomes_survive_json() -> None:
 def test_merged_outcomes_add_up_and_keep_the_worst_violation_and_the_pipeline_s_order() -> None:
     grid = DensityMap((0.0, 1.0), (0.0, 1.0), np.ones((2, 2), np.int64), np.zeros((2, 2), np.int64))
     parts = [
-        Outcome(tried=5, accepted=2, rejections={"a": 2, "c": 1}, verification={"g": 0.1}),
-        Outcome(tried=9, accepted=3, rejections={"a": 1, "b": 2, "c": 0, "d": 3}, verification={"g": 0.3, "h": 0.2}),
-        Outcome(tried=2, accepted=1, rejections={"z": 1}, densities={"goal": grid}, verification={"g": 0.2}),
-        Outcome(tried=0, accepted=0, densities={"goal": grid}),
+        Fates(tried=5, accepted=2, rejections={"a": 2, "c": 1}, verification={"g": 0.1}),
+        Fates(tried=9, accepted=3, rejections={"a": 1, "b": 2, "c": 0, "d": 3}, verification={"g": 0.3, "h": 0.2}),
+        Fates(tried=2, accepted=1, rejections={"z": 1}, densities={"goal": grid}, verification={"g": 0.2}),
+        Fates(tried=0, accepted=0, densities={"goal": grid}),
     ]
-    merged = merge_outcomes(parts)
+    merged = merge_fates(parts)
     assert (merged.tried, merged.accepted) == (16, 6)
     assert list(merged.rejections.items()) == [("z", 1), ("a", 3), ("b", 2), ("c", 1), ("d", 3)]
     assert merged.verification == {"g": 0.3, "h": 0.2}
@@ -177,9 +177,9 @@ def test_merged_outcomes_add_up_and_keep_the_worst_violation_and_the_pipeline_s_
 
 def test_draws_without_a_fate_and_violations_that_are_not_numbers_are_refused() -> None:
     with pytest.raises(DatasetError, match="5 draws, but 2 accepted and 2 rejected"):
-        Outcome(tried=5, accepted=2, rejections={"a": 2})
+        Fates(tried=5, accepted=2, rejections={"a": 2})
     with pytest.raises(DatasetError, match="'plane' must be a finite number, got nan"):
-        Outcome(tried=1, accepted=1, verification={"plane": float("nan")})
+        Fates(tried=1, accepted=1, verification={"plane": float("nan")})
 
 
 def test_density_maps_of_different_grids_are_not_merged() -> None:

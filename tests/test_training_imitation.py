@@ -17,7 +17,7 @@ from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.data import open_source
+from cnpgen.training.data import open_training_data
 from cnpgen.training.step import imitation_loss
 from cnpgen.training.train import train_model
 
@@ -78,7 +78,7 @@ def test_network_boundary_and_distance_together_have_the_gradient_of_finite_diff
 
 
 def test_demonstrations_are_the_plans_of_the_rows(shown):
-    found, columns = open_source(shown).demonstrations(6), columns_of(shown)
+    found, columns = open_training_data(shown).demonstrations(6), columns_of(shown)
     assert found is not None
     assert found.path.shape == (64, 15, 6)
     np.testing.assert_allclose(found.path[7].ravel(), columns["path_control_points"][7], rtol=1e-6)

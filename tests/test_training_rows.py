@@ -8,7 +8,7 @@ from example_models import boundary_of_columns, surroundings_of
 from cnpgen.loader.order import Order
 from cnpgen.planner.kit import make_kit
 from cnpgen.training import rows as rows_module
-from cnpgen.training.data import open_source
+from cnpgen.training.data import open_training_data
 from cnpgen.training.prepare import prepare_run
 from cnpgen.training.rows import StepRows, prepare_rows
 from cnpgen.training.settings import METRICS, TrainingSettings
@@ -42,7 +42,7 @@ def test_the_order_of_rows_is_the_loader_s_which_no_numpy_changes():
 
 @pytest.mark.parametrize("checks", [2, 20, 1000])
 def test_check_rows_are_not_among_those_that_the_last_model_is_judged_on(tiny, checks):
-    source = open_source(tiny("airhockey-hit"))
+    source = open_training_data(tiny("airhockey-hit"))
     checked, judged = source.checked(checks).start_q, source.judged(2000, after=checks).start_q
     assert len(checked) == min(checks, 30)
     assert len(checked) + len(judged) == 60
@@ -51,7 +51,7 @@ def test_check_rows_are_not_among_those_that_the_last_model_is_judged_on(tiny, c
 
 
 def test_the_published_metric_learns_with_the_published_form(tiny):
-    source = open_source(tiny("heavy-object"))
+    source = open_training_data(tiny("heavy-object"))
     for metric, form in (("learned", "paper"), ("ramped", "signed")):
         settings = TrainingSettings(hidden=8, layers=1, nodes=16, metric=METRICS[metric])
         run, _ = prepare_run(source, surroundings_of("heavy-object"), settings, check_rows=2)

@@ -15,7 +15,7 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.store.blueprint import ShardTask, load_plan, shards
+from cnpgen.store.blueprint import ShardTask, load_blueprint, shards
 from cnpgen.store.check import MAKE_AGAIN
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.layout import MANIFEST
@@ -43,7 +43,7 @@ def copied(tiny: Tiny, tmp_path: Path, name: str = "airhockey-hit") -> Path:
 
 
 def task_of(folder: Path, file: str) -> ShardTask:
-    return next(task for task in shards(load_plan(folder)) if task.file == file)
+    return next(task for task in shards(load_blueprint(folder)) if task.file == file)
 
 
 def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
@@ -51,7 +51,7 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
     task = task_of(folder, file)
     with h5py.File(folder / file, "r+") as shard:
         change(shard)
-    record, plan = load_record(folder, task), load_plan(folder)
+    record, plan = load_record(folder, task), load_blueprint(folder)
     columns, statistics = read_shard(folder / file), record.statistics
     if len(columns) == len(plan.fields) and all(np.isfinite(values).all() for values in columns.values()):
         statistics = column_statistics(columns, plan.fields)
@@ -337,7 +337,7 @@ def test_differences_that_another_machine_s_arithmetic_makes_are_no_fault_but_no
     def change(shard: h5py.File) -> None:
         shard["start_q"][5, 0] += 1e-12
 
-    for task in shards(load_plan(damaged)):
+    for task in shards(load_blueprint(damaged)):
         edit(damaged, task.file, change)
     report = validate_dataset(damaged, regenerate=8)
     assert report.ok
@@ -395,7 +395,7 @@ def test_a_folder_that_holds_something_else_is_refused(tmp_path):
 
 
 def test_a_backend_that_does_not_work_here_is_a_machine_error(damaged: Path, monkeypatch, fresh_compiler):
-    if load_plan(damaged).backend != "compiled":
+    if load_blueprint(damaged).backend != "compiled":
         pytest.skip("no C compiler on this machine")
     monkeypatch.setenv("CC", "/bin/false")
     with pytest.raises(MachineError, match="/bin/false"):
@@ -409,5 +409,5 @@ def test_the_robot_of_the_plan_is_used_and_not_the_one_that_is_shipped(damaged: 
     with h5py.File(damaged / "train/shard-00000.h5") as shard:
         q, xyz = shard["start_q"][0], shard["start_xyz"][0]
     np.testing.assert_allclose(Arm(robot).pose(q).translation, xyz, atol=1e-9)
-    plan = load_plan(damaged)
+    plan = load_blueprint(damaged)
     assert plan.robot["urdf"] == robot.urdf.read_text()

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli.describe import table
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.make.blueprint import plan_dataset
+from cnpgen.make.blueprint import draw_up
 from cnpgen.make.load import load_notes
-from cnpgen.store.blueprint import DatasetPlan, shards
+from cnpgen.store.blueprint import Blueprint, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.record import pending
 from cnpgen.store.shard import storage_dtype
@@ -26,46 +26,51 @@ def plan_text(recipe: "DatasetRecipe", *, force: bool, **settings: Any) -> str:
     Args:
         recipe: The recipe.
         force: Whether another dataset in the folder would be replaced.
-        settings: Arguments of ``plan_dataset``.
+        settings: Arguments of ``draw_up``.
 
     Raises:
         CnpgenError: The dataset cannot be made like this.
     """
     load_notes(recipe)
-    job = plan_dataset(recipe, **settings, resume=not force)
-    plan = job.plan
-    files = shards(plan)
-    splits = [f"{split} {rows:,}" for split, rows in plan.splits.items()]
-    counts = [f"{split} {sum(task.split == split for task in files)}" for split in plan.splits]
+    job = draw_up(recipe, **settings, resume=not force)
+    blueprint = job.blueprint
+    files = shards(blueprint)
+    splits = [f"{split} {rows:,}" for split, rows in blueprint.splits.items()]
+    counts = [f"{split} {sum(task.split == split for task in files)}" for split in blueprint.splits]
     facts = [
         ("folder", job.folder),
-        ("state", folder_state(job.folder, plan, force=force)),
-        ("rows", f"{sum(plan.splits.values()):,}: {', '.join(splits)}"),
-        ("shards", f"{len(files)} of at most {plan.shard_size:,} rows: {', '.join(counts)}"),
-        ("size", f"about {size_text(estimate_bytes(plan))}, {row_bytes(plan)} bytes per row"),
-        ("seed", str(plan.seed)),
-        ("backend", plan.backend),
-        ("dtype", plan.dtype),
-        ("recipe", f"sha256 {plan.recipe_sha256}"),
+        ("state", folder_state(job.folder, blueprint, force=force)),
+        ("rows", f"{sum(blueprint.splits.values()):,}: {', '.join(splits)}"),
+        ("shards", f"{len(files)} of at most {blueprint.shard_size:,} rows: {', '.join(counts)}"),
+        ("size", f"about {size_text(estimate_bytes(blueprint))}, {row_bytes(blueprint)} bytes per row"),
+        ("seed", str(blueprint.seed)),
+        ("backend", blueprint.backend),
+        ("dtype", blueprint.dtype),
+        ("recipe", f"sha256 {blueprint.recipe_sha256}"),
     ]
     fields = [("field", "columns", "unit", "what")]
-    fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in plan.fields]
+    fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in blueprint.fields]
     return "\n".join(
-        [f"{plan.name} {plan.version}", *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))]
+        [
+            f"{blueprint.name} {blueprint.version}",
+            *table(facts, indent="  "),
+            "",
+            *table(fields, indent="  ", right=(1,)),
+        ]
     )
 
 
-def row_bytes(plan: DatasetPlan) -> int:
+def row_bytes(blueprint: Blueprint) -> int:
     """Return what a row takes."""
-    return sum(max(field.width, 1) * storage_dtype(field, plan.dtype).itemsize for field in plan.fields)
+    return sum(max(field.width, 1) * storage_dtype(field, blueprint.dtype).itemsize for field in blueprint.fields)
 
 
-def estimate_bytes(plan: DatasetPlan) -> int:
+def estimate_bytes(blueprint: Blueprint) -> int:
     """Estimate what the finished dataset takes."""
-    return sum(plan.splits.values()) * row_bytes(plan) + len(shards(plan)) * SHARD_OVERHEAD + DOCUMENTS
+    return sum(blueprint.splits.values()) * row_bytes(blueprint) + len(shards(blueprint)) * SHARD_OVERHEAD + DOCUMENTS
 
 
-def folder_state(folder: Path, plan: DatasetPlan, *, force: bool) -> str:
+def folder_state(folder: Path, blueprint: Blueprint, *, force: bool) -> str:
     """Say what is in the folder and what making the dataset would do to it."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return "new"
@@ -73,7 +78,7 @@ def folder_state(folder: Path, plan: DatasetPlan, *, force: bool) -> str:
         return "holds something else: would be refused"
     if force:
         return _replacement(folder)
-    return _refusal(folder, plan) or _progress(folder, plan)
+    return _refusal(folder, blueprint) or _progress(folder, blueprint)
 
 
 def _replacement(folder: Path) -> str:
@@ -85,10 +90,10 @@ def _replacement(folder: Path) -> str:
     return "holds a dataset, which would be replaced"
 
 
-def _refusal(folder: Path, plan: DatasetPlan) -> str:
+def _refusal(folder: Path, blueprint: Blueprint) -> str:
     """Say what becomes of a dataset that is not the planned one; nothing if it is."""
     try:
-        same = holds_plan(folder, plan)
+        same = holds_plan(folder, blueprint)
     except UsageError:
         return "holds another dataset: would be refused without --force"
     except DatasetError:
@@ -96,9 +101,9 @@ def _refusal(folder: Path, plan: DatasetPlan) -> str:
     return "" if same else "holds a plan of which nothing was made: would be replaced"
 
 
-def _progress(folder: Path, plan: DatasetPlan) -> str:
+def _progress(folder: Path, blueprint: Blueprint) -> str:
     """Say how far a dataset is."""
-    todo, count = len(pending(folder, plan)), len(shards(plan))
+    todo, count = len(pending(folder, blueprint)), len(shards(blueprint))
     if todo == 0 and (folder / MANIFEST).is_file():
         return "complete already"
     return f"{count - todo} of {count} shards are there: would go on"

@@ -11,7 +11,7 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 if TYPE_CHECKING:
     from cnpgen.store.field import Field
     from cnpgen.store.inspection import Inspection
-    from cnpgen.store.outcome import Outcome
+    from cnpgen.store.outcome import Fates
     from cnpgen.store.statistics import FieldStatistics
 
 
@@ -50,12 +50,14 @@ def inspection_text(found: "Inspection") -> str:
     """Lay out an inspection for people."""
     from cnpgen.cli.describe import table
 
-    plan = found.plan
-    sections = [[f"{plan.name} {plan.version}  {plan.title}".rstrip(), *table(_facts(found), indent="  ")]]
+    blueprint = found.blueprint
+    sections = [
+        [f"{blueprint.name} {blueprint.version}  {blueprint.title}".rstrip(), *table(_facts(found), indent="  ")]
+    ]
     if found.outcome.tried:
         sections.append(_yield_lines(found.outcome))
     head = ("field", "column", "unit", "min", "mean", "max")
-    rows = [row for field in plan.fields for row in _field_rows(field, found.statistics.get(field.name))]
+    rows = [row for field in blueprint.fields for row in _field_rows(field, found.statistics.get(field.name))]
     sections.append(table([(*row, "") for row in (head, *rows)], indent="  ", right=(3, 4, 5)))
     return "\n\n".join("\n".join(lines) for lines in sections)
 
@@ -63,25 +65,25 @@ def inspection_text(found: "Inspection") -> str:
 def _facts(found: "Inspection") -> list[tuple[str, str]]:
     from cnpgen.cli.dry_run import size_text
 
-    plan = found.plan
+    blueprint = found.blueprint
     splits = [
-        f"{split} {n:,}" + ("" if n == plan.splits[split] else f" of {plan.splits[split]:,}")
+        f"{split} {n:,}" + ("" if n == blueprint.splits[split] else f" of {blueprint.splits[split]:,}")
         for split, n in found.rows.items()
     ]
     versions = [", ".join(f"{name} {version}" for name, version in made.items()) for made in found.environments]
     return [
         ("state", found.state),
         ("rows", f"{sum(found.rows.values()):,}: {', '.join(splits)}"),
-        ("shards", f"{len(found.summary.records)} of at most {plan.shard_size:,} rows"),
-        ("size", f"{size_text(found.bytes)}, {plan.dtype}"),
-        ("seed", str(plan.seed)),
-        ("backend", f"{plan.backend}, {found.seconds:,.1f} s of work"),
-        ("recipe", f"sha256 {plan.recipe_sha256}"),
+        ("shards", f"{len(found.summary.records)} of at most {blueprint.shard_size:,} rows"),
+        ("size", f"{size_text(found.bytes)}, {blueprint.dtype}"),
+        ("seed", str(blueprint.seed)),
+        ("backend", f"{blueprint.backend}, {found.seconds:,.1f} s of work"),
+        ("recipe", f"sha256 {blueprint.recipe_sha256}"),
         *(("made with", text) for text in versions),
     ]
 
 
-def _yield_lines(outcome: "Outcome") -> list[str]:
+def _yield_lines(outcome: "Fates") -> list[str]:
     """Lay out the fates of the draws, in pipeline order."""
     from cnpgen.cli.describe import table
 

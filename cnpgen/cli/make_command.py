@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from cnpgen.make.dataset import MadeDataset
     from cnpgen.make.recipe import DatasetRecipe
-    from cnpgen.store.outcome import Outcome
+    from cnpgen.store.outcome import Fates
 
 KEPT = "finished shards are kept, run the same command again to go on"
 
@@ -100,7 +100,7 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
         raise_if_interrupted()
         meter.begin(f"{step} {folder}", rows, there)
 
-    def count(rows: int, outcome: "Outcome | None") -> None:
+    def count(rows: int, outcome: "Fates | None") -> None:
         raise_if_interrupted()
         meter(rows, outcome)
 
@@ -136,7 +136,7 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) ->
     wanted = sum(made.rows.values())
     text, rest = _rows_text(made.rows), "" if made.complete else "; other parts are still to be made"
     if part is not None:
-        all_rows = counted(sum(made.plan.splits.values()), "row")
+        all_rows = counted(sum(made.blueprint.splits.values()), "row")
         text, rest = f"{text}, part {part[0]}/{part[1]} of {all_rows},", rest or "; all parts are made"
     if not made.made:
         return [f"{_unmade(made, part)}: {text.rstrip(',')}{rest}"]
@@ -161,7 +161,7 @@ def _rows_text(rows: "Mapping[str, int]") -> str:
     return counted(sum(rows.values()), "row") + (f" ({splits})" if splits else "")
 
 
-def _yield(outcome: "Outcome") -> str:
+def _yield(outcome: "Fates") -> str:
     """Say how many draws were accepted and why most of the others were not."""
     tried = max(outcome.tried, 1)
     worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
-    from cnpgen.store.outcome import Outcome
+    from cnpgen.store.outcome import Fates
 
 
 class Meter:
@@ -25,7 +25,7 @@ class Meter:
 
     def __init__(self, *, quiet: bool = False, noun: str = "row") -> None:
         self.rows = 0
-        self.outcome: Outcome | None = None
+        self.outcome: Fates | None = None
         self._quiet, self._noun = quiet, noun
         self._start = self._begun = time.perf_counter()
         self._bar: Any = None
@@ -66,7 +66,7 @@ class Meter:
         """Time since the last beginning [s]."""
         return time.perf_counter() - self._begun
 
-    def __call__(self, rows: int, outcome: "Outcome | None" = None) -> None:
+    def __call__(self, rows: int, outcome: "Fates | None" = None) -> None:
         """Count the rows of a shard."""
         self.rows += rows
         if outcome is not None:

@@ -80,11 +80,11 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
 def _rows(folder: Path) -> int:
     """Return how many rows there are to compute again; 0 if the plan cannot say, which validation will report."""
     from cnpgen.errors import DatasetError
-    from cnpgen.store.blueprint import load_plan, shards
+    from cnpgen.store.blueprint import load_blueprint, shards
     from cnpgen.store.record import is_committed
 
     try:
-        plan = load_plan(folder)
+        blueprint = load_blueprint(folder)
     except DatasetError:
         return 0
-    return sum(task.rows for task in shards(plan) if is_committed(folder, task, plan.fingerprint))
+    return sum(task.rows for task in shards(blueprint) if is_committed(folder, task, blueprint.fingerprint))

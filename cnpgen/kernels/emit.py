@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.kernels.tape import NAMES, Grid, Tape
+from cnpgen.kernels.tape import NAMES, GridSpec, Tape
 
 VECTORS = Path(__file__).with_name("vectors.h")
 
@@ -87,7 +87,7 @@ store(out[1],k,n,error);
 """
 
 
-def _emit_grid(tape: Tape, grid: Grid) -> str:
+def _emit_grid(tape: Tape, grid: GridSpec) -> str:
     """The form with nodes: all lanes of a node, then the next one, so that rows are read from end to end."""
 
     def read(argument: int, component: int) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.tape import Axes, Grid, Tape
+from cnpgen.kernels.tape import Axes, GridSpec, Tape
 
 Array = NDArray[Any]
 
@@ -39,7 +39,7 @@ class GridKernel(ABC):
         """
 
 
-def check_grid(tape: Tape, grid: Grid, arguments: Sequence[Array], out: Sequence[Array]) -> tuple[int, int]:
+def check_grid(tape: Tape, grid: GridSpec, arguments: Sequence[Array], out: Sequence[Array]) -> tuple[int, int]:
     """Return K and N, or raise ValueError where arguments and results do not fit the tape."""
     if (len(arguments), len(out)) != (len(tape.inputs), len(tape.outputs)):
         raise ValueError(

@@ -21,7 +21,7 @@ from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
-from cnpgen.kernels.tape import CODES, Dtype, Grid, Loop, Tape, tape_from_function
+from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.kernels.together import Compilers
 from cnpgen.schema.registry import package_digest
 
@@ -81,7 +81,7 @@ class KernelLibrary:
             finally:
                 self._compilers = None
 
-    def load_grid(self, builder: Callable[..., Any], grid: Grid, *, dtype: Dtype, **parameters: Any) -> GridKernel:
+    def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
         """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
 
         Args:
@@ -110,7 +110,7 @@ class KernelLibrary:
         parameters: Mapping[str, Any],
         *,
         loop: Loop | None = None,
-        grid: Grid | None = None,
+        grid: GridSpec | None = None,
         dtype: Dtype = "float64",
     ) -> Tape:
         import importlib.metadata

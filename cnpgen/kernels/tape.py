@@ -42,7 +42,7 @@ DTYPES: tuple[Dtype, ...] = ("float64", "float32")
 
 
 @dataclass(frozen=True)
-class Grid:
+class GridSpec:
     """Evaluate the tape at K nodes of every lane, and keep results per point or sum them over the nodes of a lane.
 
     Attributes:
@@ -83,7 +83,7 @@ class Tape:
     b: NDArray[np.int32]
     constant: NDArray[np.float64]
     loop: Loop | None = None
-    grid: Grid | None = None
+    grid: GridSpec | None = None
     dtype: Dtype = "float64"
 
     def __len__(self) -> int:
@@ -122,7 +122,7 @@ class Tape:
             np.load(buffer, allow_pickle=False) for _ in range(11)
         )
         iteration = Loop(float(loop[0]), int(loop[1])) if len(loop) else None
-        grid = Grid(tuple(AXES[i] for i in arguments), tuple(AXES[i] for i in results)) if len(arguments) else None
+        grid = GridSpec(tuple(AXES[i] for i in arguments), tuple(AXES[i] for i in results)) if len(arguments) else None
         operation, a, b, constant = program
         return cls(
             bytes(name).decode(),
@@ -139,7 +139,7 @@ class Tape:
 
 
 def tape_from_function(
-    function: Any, loop: Loop | None = None, *, grid: Grid | None = None, dtype: Dtype = "float64"
+    function: Any, loop: Loop | None = None, *, grid: GridSpec | None = None, dtype: Dtype = "float64"
 ) -> Tape:
     """Flatten a CasADi SX function.
 
@@ -194,7 +194,7 @@ def _check_dense(function: Any) -> None:
                 raise ValueError(f"{function.name()}: {what} {index} is sparse; densify it")
 
 
-def _check_grid(function: Any, grid: Grid | None) -> None:
+def _check_grid(function: Any, grid: GridSpec | None) -> None:
     """Raise for a grid that is not about this function."""
     if grid is None:
         return

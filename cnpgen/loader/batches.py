@@ -14,7 +14,7 @@ from cnpgen.loader.form import Form
 from cnpgen.loader.kept import Kept, make_kept
 from cnpgen.loader.order import Order
 from cnpgen.loader.position import Position, position_from_json, position_to_json
-from cnpgen.loader.shards import Source
+from cnpgen.loader.shards import SplitShards
 from cnpgen.loader.windows import Windows
 from cnpgen.schema.arguments import integer
 
@@ -38,7 +38,7 @@ class Batches:
         UsageError: There are fewer rows than one batch needs, or in the last batch than there are ranks.
     """
 
-    def __init__(self, source: Source, form: Form, cut: Cut, position: Position) -> None:
+    def __init__(self, source: SplitShards, form: Form, cut: Cut, position: Position) -> None:
         if cut.drop_last and cut.batch_size > source.rows:
             raise UsageError(
                 f"batch_size {cut.batch_size} is more than the {source.rows} rows of split {source.split!r};"

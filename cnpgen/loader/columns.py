@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from cnpgen.errors import UsageError
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.field import Field
 
 
@@ -54,11 +54,11 @@ def tail(field: Field) -> tuple[int, ...]:
     return (field.width,) if field.width else ()
 
 
-def select_columns(plan: DatasetPlan, names: Iterable[str] | None) -> Columns:
+def select_columns(blueprint: Blueprint, names: Iterable[str] | None) -> Columns:
     """Look fields up by name.
 
     Args:
-        plan: The dataset's plan.
+        blueprint: The dataset's plan.
         names: Names in the order they are wanted in; by default all fields of numbers that are not diagnostics, in
             the plan's order.
 
@@ -67,10 +67,12 @@ def select_columns(plan: DatasetPlan, names: Iterable[str] | None) -> Columns:
         UsageError: The names are a single text, none, or not different.
     """
     if names is None:
-        return Columns(tuple(field for field in plan.fields if field.dtype == "float" and field.role != "diagnostic"))
+        return Columns(
+            tuple(field for field in blueprint.fields if field.dtype == "float" and field.role != "diagnostic")
+        )
     if isinstance(names, str):
         raise UsageError(f"fields must be a list of names, got the text {names!r}: write [{names!r}]")
     wanted: Sequence[str] = tuple(names)
     if not wanted or len(set(wanted)) != len(wanted):
         raise UsageError(f"fields must be one or more different names, got {list(wanted)}")
-    return Columns(tuple(plan.field_named(name) for name in wanted))
+    return Columns(tuple(blueprint.field_named(name) for name in wanted))

@@ -15,9 +15,9 @@ from cnpgen.loader.form import Form, make_form
 from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
-from cnpgen.loader.shards import Shard, ShardReader, Source
+from cnpgen.loader.shards import Shard, ShardReader, SplitShards
 from cnpgen.loader.split import Split
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
 
@@ -32,7 +32,7 @@ class Dataset:
 
     Attributes:
         folder: Its folder.
-        plan: Its plan: recipe, seed, robot, versions.
+        blueprint: Its plan: recipe, seed, robot, versions.
         fingerprint: Fingerprint of the rows that are there; equal fingerprints, equal rows.
         shards: Split -> its shards that are there.
         statistics: Split -> field -> statistics of its columns, in the field's unit.
@@ -40,7 +40,7 @@ class Dataset:
     """
 
     folder: Path
-    plan: DatasetPlan
+    blueprint: Blueprint
     fingerprint: str
     shards: Mapping[str, tuple[Shard, ...]]
     statistics: Mapping[str, Mapping[str, FieldStatistics]]
@@ -48,7 +48,7 @@ class Dataset:
 
     def __repr__(self) -> str:
         rows = ", ".join(f"{rows:,} {split}" for split, rows in self.splits.items())
-        return f"<{self.plan.name} {self.plan.version} in {self.folder}: {rows}>"
+        return f"<{self.blueprint.name} {self.blueprint.version} in {self.folder}: {rows}>"
 
     @cached_property
     def splits(self) -> dict[str, int]:
@@ -58,13 +58,13 @@ class Dataset:
     @cached_property
     def fields(self) -> dict[str, Field]:
         """Name -> what a field is: unit, names and limits of its columns, role."""
-        return {field.name: field for field in self.plan.fields}
+        return {field.name: field for field in self.blueprint.fields}
 
     @cached_property
     def normalization(self) -> Normalization | None:
         """Means and deviations of the training rows; None if there are none."""
         found = self.statistics.get("train")
-        return make_normalization(found, self.plan.fields) if found else None
+        return make_normalization(found, self.blueprint.fields) if found else None
 
     def __getitem__(self, split: str) -> Split:
         return Split(self._source(split), self._form())
@@ -165,10 +165,10 @@ class Dataset:
         everything = np.arange(self._source(split).rows)
         return self.rows(split, everything, fields=fields, normalize=normalize, dtype=dtype)
 
-    def _source(self, split: str) -> Source:
+    def _source(self, split: str) -> SplitShards:
         if split not in self.shards:
             raise DatasetError(f"{self.folder} has no split {split!r}{nearest(str(split), self.shards)}")
-        return Source(split, self.shards[split], self.reader, self.fingerprint, self.plan.dtype)
+        return SplitShards(split, self.shards[split], self.reader, self.fingerprint, self.blueprint.dtype)
 
     def _form(
         self,
@@ -177,4 +177,4 @@ class Dataset:
         normalize: bool | Normalization = False,
         dtype: DTypeLike | None = None,
     ) -> Form:
-        return make_form(self.plan, self.normalization, fields=fields, normalize=normalize, dtype=dtype)
+        return make_form(self.blueprint, self.normalization, fields=fields, normalize=normalize, dtype=dtype)

@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.columns import Columns, select_columns
 from cnpgen.loader.normalization import Normalization
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 
 DTYPES = ("float32", "float64")
 
@@ -43,7 +43,7 @@ class Form:
 
 
 def make_form(
-    plan: DatasetPlan,
+    blueprint: Blueprint,
     own: Normalization | None,
     *,
     fields: Iterable[str] | None,
@@ -53,7 +53,7 @@ def make_form(
     """Settle what is delivered.
 
     Args:
-        plan: The dataset's plan.
+        blueprint: The dataset's plan.
         own: The dataset's own normalisation, if it has training rows.
         fields: Names of the fields; by default all fields of numbers that are not diagnostics.
         normalize: Whether to normalise, or what with instead of the dataset's own.
@@ -63,20 +63,20 @@ def make_form(
         DatasetError: There is no such field, or nothing to normalise it with.
         UsageError: The names, the normalisation or the type cannot be meant.
     """
-    normalization = normalize if isinstance(normalize, Normalization) else _own(plan, own, normalize)
-    layout = select_columns(plan, fields)
+    normalization = normalize if isinstance(normalize, Normalization) else _own(blueprint, own, normalize)
+    layout = select_columns(blueprint, fields)
     if normalization is not None:
         normalization.side_by_side(layout.floats)  # a missing field is noticed here, not in a thread
-    return Form(layout, normalization, _float_dtype(plan.dtype if dtype is None else dtype))
+    return Form(layout, normalization, _float_dtype(blueprint.dtype if dtype is None else dtype))
 
 
-def _own(plan: DatasetPlan, own: Normalization | None, normalize: object) -> Normalization | None:
+def _own(blueprint: Blueprint, own: Normalization | None, normalize: object) -> Normalization | None:
     if not isinstance(normalize, bool | np.bool_):
         raise UsageError(f"normalize must be True, False or the normalization of a dataset, got {normalize!r:.100}")
     if normalize and own is None:
         raise DatasetError(
-            f"{plan.name} has no training rows to normalise with; pass normalize=False, or the normalization of the"
-            " dataset that the model was trained on"
+            f"{blueprint.name} has no training rows to normalise with; pass normalize=False, or the normalization of"
+            " the dataset that the model was trained on"
         )
     return own if normalize else None
 

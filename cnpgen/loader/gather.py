@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.loader.columns import Columns, tail
-from cnpgen.loader.shards import Source
+from cnpgen.loader.shards import SplitShards
 from cnpgen.store.shard import storage_dtype
 
 Rows = dict[str, NDArray[Any]]
@@ -19,7 +19,7 @@ class RowError(UsageError, IndexError):
     """A row that the split does not have."""
 
 
-def gather(source: Source, indices: ArrayLike, layout: Columns) -> Rows:
+def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
     """Read single rows.
 
     Args:
@@ -44,7 +44,7 @@ def gather(source: Source, indices: ArrayLike, layout: Columns) -> Rows:
     return found
 
 
-def _checked(indices: ArrayLike, source: Source) -> Indices:
+def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
     """Return row numbers, counted from the beginning, shape (k,)."""
     rows = np.asarray(indices)
     if rows.size == 0:
@@ -57,7 +57,7 @@ def _checked(indices: ArrayLike, source: Source) -> Indices:
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 
-def _by_shard(rows: Indices, source: Source) -> Iterator[tuple[int, Indices, Indices]]:
+def _by_shard(rows: Indices, source: SplitShards) -> Iterator[tuple[int, Indices, Indices]]:
     """Give the number of every shard that is needed, the places of its rows in the result, and the rows within it."""
     ends = np.cumsum([shard.rows for shard in source.shards])
     shards = np.searchsorted(ends, rows, side="right")

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.loader.form import Form
 from cnpgen.loader.packed import Packed, empty_packed, pack, row_bytes
-from cnpgen.loader.shards import Source
+from cnpgen.loader.shards import SplitShards
 
 KEEP_BYTES = 1 << 28
 
@@ -25,7 +25,7 @@ class Kept:
         packed: Room for all rows, in their stored order.
     """
 
-    def __init__(self, source: Source, form: Form) -> None:
+    def __init__(self, source: SplitShards, form: Form) -> None:
         self._source, self._form = source, form
         self._firsts = np.cumsum([0, *(shard.rows for shard in source.shards)]).tolist()
         self._there: set[int] = set()
@@ -55,6 +55,6 @@ class Kept:
         return np.concatenate(places)
 
 
-def make_kept(source: Source, form: Form) -> Kept | None:
+def make_kept(source: SplitShards, form: Form) -> Kept | None:
     """Make room for a whole split, if it takes at most 256 MiB."""
     return Kept(source, form) if source.rows * row_bytes(form) <= KEEP_BYTES else None

@@ -8,7 +8,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.schema.arguments import flag
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.files.documents import load_document
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import STATS
@@ -38,30 +38,33 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
     folder, verify = Path(folder), flag("verify", verify)
     stored = open_dataset(folder, allow_partial=flag("allow_incomplete", allow_incomplete))
     if stored.manifest is None:
-        summary = summarise(folder, stored.plan, allow_partial=True)
+        summary = summarise(folder, stored.blueprint, allow_partial=True)
         shards, statistics = _recorded(folder, summary), summary.statistics
     else:
-        shards, statistics = _listed(folder, stored.plan, stored.manifest), _load_statistics(folder, stored.plan)
+        shards, statistics = (
+            _listed(folder, stored.blueprint, stored.manifest),
+            _load_statistics(folder, stored.blueprint),
+        )
     present = _present(folder, shards, allow_incomplete=allow_incomplete)
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
     )
-    return Dataset(folder, stored.plan, fingerprint, present, statistics, ShardReader(verify=verify))
+    return Dataset(folder, stored.blueprint, fingerprint, present, statistics, ShardReader(verify=verify))
 
 
 def _recorded(folder: Path, summary: Summary) -> dict[str, list[Shard]]:
     """List the shards of an unfinished dataset by their sidecars."""
-    plan = summary.plan
+    blueprint = summary.blueprint
     return {
         split: [
-            Shard(folder / task.file, record.rows, record.first_sample_id, record.bytes, record.sha256, plan.key)
+            Shard(folder / task.file, record.rows, record.first_sample_id, record.bytes, record.sha256, blueprint.key)
             for task, record in summary.of_split(split)
         ]
-        for split in plan.splits
+        for split in blueprint.splits
     }
 
 
-def _listed(folder: Path, plan: DatasetPlan, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
+def _listed(folder: Path, blueprint: Blueprint, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
     """List the shards of a finished dataset by its manifest."""
     return {
         split: [
@@ -71,7 +74,7 @@ def _listed(folder: Path, plan: DatasetPlan, manifest: Mapping[str, Any]) -> dic
                 entry["first_sample_id"],
                 entry["bytes"],
                 entry["sha256"],
-                plan.key,
+                blueprint.key,
             )
             for entry in content["shards"]
         ]
@@ -79,11 +82,11 @@ def _listed(folder: Path, plan: DatasetPlan, manifest: Mapping[str, Any]) -> dic
     }
 
 
-def _load_statistics(folder: Path, plan: DatasetPlan) -> Statistics:
+def _load_statistics(folder: Path, blueprint: Blueprint) -> Statistics:
     """Read the statistics of a finished dataset."""
     path = folder / STATS
     document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION)
-    if document["plan_fingerprint"] != plan.fingerprint:
+    if document["plan_fingerprint"] != blueprint.fingerprint:
         raise DatasetError(f"{path} is of another plan than plan.json; {AGAIN}")
     return {
         split: {name: statistics_from_json(content) for name, content in fields.items()}

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader.shards import Source
+from cnpgen.loader.shards import SplitShards
 from cnpgen.schema.arguments import flag, integer
 
 FORMAT = "cnpgen-loader-state"
@@ -41,13 +41,13 @@ def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Po
     )
 
 
-def position_to_json(position: Position, source: Source) -> dict[str, Any]:
+def position_to_json(position: Position, source: SplitShards) -> dict[str, Any]:
     """Return a position and what it is a position in as a small JSON-able dict."""
     head = {"format": FORMAT, "format_version": FORMAT_VERSION}
     return head | {"fingerprint": source.fingerprint, "split": source.split, **asdict(position)}
 
 
-def position_from_json(state: Mapping[str, Any], source: Source) -> Position:
+def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Position:
     """Rebuild a position.
 
     Raises:

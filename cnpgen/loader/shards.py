@@ -128,7 +128,7 @@ def _check_field(shard: Shard, field: Field, found: Placement | None) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class SplitShards:
     """The shards of a split.
 
     Attributes:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from cnpgen.loader.form import Form
 from cnpgen.loader.gather import Rows, gather
-from cnpgen.loader.shards import Source
+from cnpgen.loader.shards import SplitShards
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Split:
         form: Which fields.
     """
 
-    source: Source
+    source: SplitShards
     form: Form
 
     def __len__(self) -> int:

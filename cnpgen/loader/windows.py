@@ -15,7 +15,7 @@ from cnpgen.loader.form import Form
 from cnpgen.loader.kept import Kept
 from cnpgen.loader.order import Order
 from cnpgen.loader.packed import Packed, empty_packed, pack
-from cnpgen.loader.shards import Source
+from cnpgen.loader.shards import SplitShards
 
 Loaded = tuple[Packed, NDArray[np.int64]]
 
@@ -51,7 +51,7 @@ class Windows:
         kept: The split's rows that are in memory already; None to keep none.
     """
 
-    def __init__(self, source: Source, form: Form, order: Order, kept: Kept | None) -> None:
+    def __init__(self, source: SplitShards, form: Form, order: Order, kept: Kept | None) -> None:
         self._source, self._form, self._order, self._kept = source, form, order, kept
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}

@@ -7,7 +7,7 @@ functions) and the quadrature weight of the node.
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.kernels.tape import Axes, Grid
+from cnpgen.kernels.tape import Axes, GridSpec
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 ARGUMENTS: tuple[Axes, ...] = ("point", "point", "point", "point", "lane", "point", "node", "fixed", "fixed")
 WIDER = 5  # which of them is the funnel
-VALUES = Grid(ARGUMENTS, ("lane",))
-GRADIENT = Grid(ARGUMENTS, ("lane", "point", "point", "point", "point"))
+VALUES = GridSpec(ARGUMENTS, ("lane",))
+GRADIENT = GridSpec(ARGUMENTS, ("lane", "point", "point", "point", "point"))
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from cnpgen.losses.funnel import Funnel, make_funnel
 from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
-from cnpgen.losses.quadrature import Table, basis_table, check_quadrature
-from cnpgen.problems.load import problem_of
+from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
+from cnpgen.problems.load import as_problem
 from cnpgen.problems.problem import Problem, problem_identity
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
@@ -87,7 +87,7 @@ class PlanLoss:
         _check_choice("dtype", dtype, DTYPES)
         _check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
-        self.problem, self.dtype, self.nodes, self.rule, self.form = problem_of(problem), dtype, nodes, rule, form
+        self.problem, self.dtype, self.nodes, self.rule, self.form = as_problem(problem), dtype, nodes, rule, form
         self.terms = ("time", *_names(self.problem))
         self.budgets = np.array([constraint.budget for constraint in self.problem.constraint])
         self.weights0 = np.array([constraint.weight for constraint in self.problem.constraint])
@@ -144,7 +144,7 @@ class PlanLoss:
         return LossValue(total, terms, path_gradient, rate_gradient)
 
     def _integrate(
-        self, batch: PlanBatch, weights: Array, table: Table, *, gradient: bool
+        self, batch: PlanBatch, weights: Array, table: BasisTable, *, gradient: bool
     ) -> tuple[Array, Array, Array]:
         """Return terms and gradients of a block, samples last; those of no plan if they are not wanted."""
         nodes, (points, n) = len(table.s), batch.path.shape[1:]
@@ -165,7 +165,7 @@ class PlanLoss:
         back = table.path.T @ by_path.reshape(3 * nodes, -1)
         return terms, back.reshape(points, n, lanes), table.rate.T @ by_rate.reshape(2 * nodes, -1)
 
-    def _wider(self, batch: PlanBatch, table: Table, lanes: int, *, gradient: bool) -> Array:
+    def _wider(self, batch: PlanBatch, table: BasisTable, lanes: int, *, gradient: bool) -> Array:
         """How much wider than their bounds the conditions with a funnel are, shape (values, K, lanes)."""
         kernel = self._gradient if gradient else self._values
         out = np.zeros((kernel.tape.inputs[WIDER], len(table.s), lanes), self.dtype)

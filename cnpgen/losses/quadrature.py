@@ -68,7 +68,7 @@ def rotating_shift(step: int, count: int = 8) -> float:
 
 
 @dataclass(frozen=True)
-class Table:
+class BasisTable:
     """The basis functions at the nodes.
 
     Attributes:
@@ -85,9 +85,9 @@ class Table:
 
 
 @lru_cache(maxsize=64)
-def basis_table(spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str) -> Table:
+def basis_table(spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str) -> BasisTable:
     """Tabulate the basis of both splines at the nodes of ``quadrature``."""
     s, weights = quadrature(rule, nodes, shift)
     path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(3)]
     rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)]
-    return Table(s, weights[None].astype(dtype), np.vstack(path).astype(dtype), np.vstack(rate).astype(dtype))
+    return BasisTable(s, weights[None].astype(dtype), np.vstack(path).astype(dtype), np.vstack(rate).astype(dtype))

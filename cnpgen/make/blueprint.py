@@ -7,13 +7,13 @@ from typing import Any
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.load import dataset_recipe_of
+from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.make.shards import Job
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import DatasetPlan, default_shard_size, load_plan
+from cnpgen.store.blueprint import Blueprint, default_shard_size, load_blueprint
 
 MAX_ROWS = 10**12
 MAX_SEED = 2**63 - 1
@@ -36,7 +36,7 @@ def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
     return folder.resolve() if ".." in folder.parts and not folder.parent.exists() else folder
 
 
-def plan_dataset(
+def draw_up(
     recipe: str | Path | DatasetRecipe,
     out: str | Path | None = None,
     *,
@@ -56,7 +56,7 @@ def plan_dataset(
         UsageError: An argument makes no sense.
         MachineError: No working backend.
     """
-    loaded = dataset_recipe_of(recipe)
+    loaded = as_dataset_recipe(recipe)
     _check(loaded, dtype)
     total = integer("n", sum(loaded.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
     root = integer("seed", loaded.seed if seed is None else seed, least=0, most=MAX_SEED)
@@ -67,7 +67,7 @@ def plan_dataset(
         shard_size = begun.shard_size if shard_size is None else shard_size
     chosen, cache_folder = choose_backend(backend)
     prepared = PreparedPipeline(loaded.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
-    plan = DatasetPlan(
+    blueprint = Blueprint(
         name=loaded.name,
         version=loaded.version,
         title=loaded.title,
@@ -84,7 +84,7 @@ def plan_dataset(
         robot=_robot_record(prepared),
         versions=versions(),
     )
-    return Job(folder, plan, loaded.pipeline, chosen, cache_folder)
+    return Job(folder, blueprint, loaded.pipeline, chosen, cache_folder)
 
 
 def _check(recipe: DatasetRecipe, dtype: str) -> None:
@@ -102,10 +102,10 @@ def _shard_size(wanted: int | None, rows: int, block_rows: int) -> int:
     return default_shard_size(rows, block_rows) if wanted is None else integer("shard_size", wanted, least=1)
 
 
-def _begun(folder: Path, recipe: DatasetRecipe) -> DatasetPlan | None:
+def _begun(folder: Path, recipe: DatasetRecipe) -> Blueprint | None:
     """Return the plan in a folder if it is one of the recipe; what else is there is not decided here."""
     try:
-        found = load_plan(folder)
+        found = load_blueprint(folder)
     except DatasetError:
         return None
     return found if found.recipe_sha256 == recipe_digest(recipe) else None

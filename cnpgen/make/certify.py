@@ -11,7 +11,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.store.field import Field
@@ -63,7 +63,7 @@ class CertifiedPlan(Stage):
             Field("duration", "s", "its motion time", role="target"),
         )
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
@@ -85,7 +85,7 @@ class CertifiedPlan(Stage):
 
         jury = Jury(problem, robot, degree=refiner.spec.degree)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             ends = (*_ENDS, "goal_ddq") if "goal_ddq" in batch.columns else _ENDS
             boundary = Boundary(*(np.ascontiguousarray(batch[name].T) for name in ends))
             starts, goals = (np.ascontiguousarray(batch[name].T) for name in ("start_xyz", "goal_xyz"))
@@ -100,7 +100,7 @@ class CertifiedPlan(Stage):
         return run
 
 
-def _write(batch: Batch, found: "list[Refined]", spec: TrajectorySpec, n: int) -> None:
+def _write(batch: Round, found: "list[Refined]", spec: TrajectorySpec, n: int) -> None:
     """Write the plans' columns and reject the samples without a valid one."""
     motion = Motion(
         np.array([each.path for each in found]).reshape(len(found), spec.path_control_points, n),

@@ -11,19 +11,19 @@ from pathlib import Path
 
 from cnpgen.errors import UsageError
 from cnpgen.machine.workers import share_out, worker_count
-from cnpgen.make.blueprint import dataset_folder, plan_dataset
+from cnpgen.make.blueprint import dataset_folder, draw_up
 from cnpgen.make.certify import certified
-from cnpgen.make.load import dataset_recipe_of, load_notes
+from cnpgen.make.load import as_dataset_recipe, load_notes
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.shards import Job, make_shards
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.check import check_documents
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize, source_date
 from cnpgen.store.mending import discard, find_damaged, made_already
-from cnpgen.store.outcome import Outcome
+from cnpgen.store.outcome import Fates
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import check_place, clear_dataset, open_workspace
 
@@ -36,7 +36,7 @@ RUN_BLOCKS = 8  # blocks that a worker makes shards from before it is given othe
 RUNS = 4  # at least, for every worker, where there are enough blocks: so that none waits long for the last one
 
 Begin = Callable[[str, Path, int, int], None]  # called with "checking" or "making", the folder, the rows, those there
-Progress = Callable[[int, Outcome | None], None]  # called with the rows of a shard and, where it was made, its outcome
+Progress = Callable[[int, Fates | None], None]  # called with the rows of a shard and, where it was made, its outcome
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class MadeDataset:
 
     Attributes:
         folder: The dataset.
-        plan: Its plan.
+        blueprint: Its plan.
         made: Rows made by this call.
         complete: Whether every shard is there and the manifest is written.
         rows: Split -> rows that this call was about: all, or those of its part.
@@ -53,7 +53,7 @@ class MadeDataset:
     """
 
     folder: Path
-    plan: DatasetPlan
+    blueprint: Blueprint
     made: int
     complete: bool
     rows: Mapping[str, int] = field(default_factory=dict)
@@ -107,30 +107,30 @@ def make_dataset(
         DatasetError: The plan in the folder is damaged.
     """
     _check(workers, part, force=force)
-    loaded = dataset_recipe_of(recipe)
+    loaded = as_dataset_recipe(recipe)
     loaded = certified(loaded) if certify else loaded
     notes = load_notes(loaded)
     check_place(dataset_folder(loaded, out))
     resume = not force
-    job = plan_dataset(loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=resume)
+    job = draw_up(loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=resume)
     job = _opened(job, force=force)
-    mine = _part(shards(job.plan), part)
+    mine = _part(shards(job.blueprint), part)
     waiting, damaged = _take_stock(job, mine, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in mine)
         begin("making", job.folder, rows, rows - sum(task.rows for task in waiting))
     made = _make(job, waiting, workers, progress)
     complete, documents = _finish(job, notes, made=made, alone=part is None)
-    rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.plan.splits}
-    return MadeDataset(job.folder, job.plan, made, complete, rows_of, (*damaged, *documents))
+    rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.blueprint.splits}
+    return MadeDataset(job.folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
 
 
 def _opened(job: Job, *, force: bool) -> Job:
     """Open the folder of a dataset; its plan is perhaps of another version, and shards say what the plan says."""
     if force:
         clear_dataset(job.folder)
-    open_workspace(job.folder, job.plan)
-    return replace(job, plan=load_plan(job.folder))
+    open_workspace(job.folder, job.blueprint)
+    return replace(job, blueprint=load_blueprint(job.folder))
 
 
 def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
@@ -147,7 +147,10 @@ def _take_stock(
     if there and begin is not None:
         begin("checking", job.folder, sum(task.rows for task in there), 0)
     damaged = find_damaged(
-        job.folder, job.plan, there, progress=lambda task: progress(task.rows, None) if progress is not None else None
+        job.folder,
+        job.blueprint,
+        there,
+        progress=lambda task: progress(task.rows, None) if progress is not None else None,
     )
     if damaged:
         first = next(iter(damaged.values()))
@@ -169,10 +172,10 @@ def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progr
     return made
 
 
-def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Outcome], None, None]:
+def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Fates], None, None]:
     """Make the shards and yield what became of them as they are committed."""
-    workers = worker_count(1 if workers is None and is_quick(job.plan, tasks) else workers, len(tasks))
-    groups = runs(job.plan, tasks, workers)
+    workers = worker_count(1 if workers is None and is_quick(job.blueprint, tasks) else workers, len(tasks))
+    groups = runs(job.blueprint, tasks, workers)
     if workers == 1:
         for group in groups:
             yield from make_shards(job, group)
@@ -183,24 +186,24 @@ def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator
             yield from made
 
 
-def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Outcome]]:
+def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Fates]]:
     """Make the shards of a run; what a worker does."""
     return list(make_shards(job, tasks))
 
 
-def is_quick(plan: DatasetPlan, tasks: list[ShardTask]) -> bool:
+def is_quick(blueprint: Blueprint, tasks: list[ShardTask]) -> bool:
     """Whether one process makes the shards before a second one would have started; small blocks mean slow rows."""
-    return plan.block_rows >= BLOCK_ROWS and sum(task.rows for task in tasks) <= ALONE[plan.backend]
+    return blueprint.block_rows >= BLOCK_ROWS and sum(task.rows for task in tasks) <= ALONE[blueprint.backend]
 
 
-def runs(plan: DatasetPlan, tasks: list[ShardTask], workers: int) -> list[list[ShardTask]]:
+def runs(blueprint: Blueprint, tasks: list[ShardTask], workers: int) -> list[list[ShardTask]]:
     """Group shards that one worker makes one after the other, so that blocks which they share are made once."""
-    if plan.shard_size % plan.block_rows == 0:
+    if blueprint.shard_size % blueprint.block_rows == 0:
         return [[task] for task in tasks]  # these share none
     blocks = RUN_BLOCKS
     if workers > 1:
-        blocks = min(max(sum(task.rows for task in tasks) // (RUNS * workers * plan.block_rows), 1), blocks)
-    rows = plan.block_rows * blocks
+        blocks = min(max(sum(task.rows for task in tasks) // (RUNS * workers * blueprint.block_rows), 1), blocks)
+    rows = blueprint.block_rows * blocks
     return [list(group) for _, group in groupby(tasks, key=lambda task: (task.split, task.first_row // rows))]
 
 
@@ -213,11 +216,11 @@ def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list
         made: Rows that this call has made.
         alone: Whether nobody else is making parts of it, who might be about to write the documents.
     """
-    if pending(job.folder, job.plan):
+    if pending(job.folder, job.blueprint):
         return False, []
     sealed, damaged = (job.folder / MANIFEST).exists(), list[str]()
     if made == 0 and (sealed or alone):
-        findings = check_documents(job.folder, job.plan)
+        findings = check_documents(job.folder, job.blueprint)
         if not findings:
             return True, []
         damaged = list(dict.fromkeys(finding.file for finding in findings))

@@ -35,7 +35,7 @@ def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = 
     return load_recipe(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
 
 
-def dataset_recipe_of(recipe: object) -> DatasetRecipe:
+def as_dataset_recipe(recipe: object) -> DatasetRecipe:
     """Return the dataset recipe that is meant: itself, or what its name or file says.
 
     Raises:

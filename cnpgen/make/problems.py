@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make.load import dataset_recipe_of
+from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.record import ProblemRecord, record_problem
@@ -22,7 +22,7 @@ from cnpgen.trajectory.boundary import Boundary
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from cnpgen.store.blueprint import DatasetPlan
+    from cnpgen.store.blueprint import Blueprint
 
 Array = NDArray[np.float64]
 SPLIT = "(fresh draws)"  # no split can be called so: no row of any dataset is among them
@@ -71,15 +71,15 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
     start = integer("start", start, least=0)
     n = None if n is None else integer("n", n, least=1)
     dataset = open_dataset(Path(folder))
-    if split not in dataset.plan.splits:
-        raise UsageError(f"{folder} has no split {split!r}: expected one of {', '.join(dataset.plan.splits)}")
-    rows = dataset.plan.splits[split]
+    if split not in dataset.blueprint.splits:
+        raise UsageError(f"{folder} has no split {split!r}: expected one of {', '.join(dataset.blueprint.splits)}")
+    rows = dataset.blueprint.splits[split]
     stop = rows if n is None else start + n
     if not 0 <= start < stop <= rows:
         wanted = f"{stop - start} from row {start} on"
         raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}")
-    source = f"dataset {dataset.plan.name}, seed {dataset.plan.seed}, split {split}"
-    return problems_of_rows(_problem_of(dataset.plan), dataset.read(split, start=start, stop=stop), source=source)
+    source = f"dataset {dataset.blueprint.name}, seed {dataset.blueprint.seed}, split {split}"
+    return problems_of_rows(record_of(dataset.blueprint), dataset.read(split, start=start, stop=stop), source=source)
 
 
 def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
@@ -99,7 +99,7 @@ def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | Non
 
     n = integer("n", n, least=1)
     root = None if seed is None else integer("seed", seed, least=0, most=2**63 - 1)
-    loaded = dataset_recipe_of(recipe)
+    loaded = as_dataset_recipe(recipe)
     backend, cache_folder = choose_backend(None)
     prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")
     rows = prepared.block_rows
@@ -116,6 +116,8 @@ def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | Non
     return problems_of_rows(record_problem(loaded.pipeline.problem), columns, source=source)
 
 
-def _problem_of(plan: "DatasetPlan") -> ProblemRecord:
+def record_of(blueprint: "Blueprint") -> ProblemRecord:
     """Return the problem that a dataset was made for."""
-    return ProblemRecord(json.dumps(plan.recipe["pipeline"]["problem"], ensure_ascii=False), plan.robot["urdf"])
+    return ProblemRecord(
+        json.dumps(blueprint.recipe["pipeline"]["problem"], ensure_ascii=False), blueprint.robot["urdf"]
+    )

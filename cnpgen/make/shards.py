@@ -16,9 +16,9 @@ from cnpgen.machine.versions import versions
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import Outcome, merge_outcomes
+from cnpgen.store.outcome import Fates, merge_fates
 from cnpgen.store.record import commit_shard
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.workspace import require_plan
@@ -32,20 +32,20 @@ class Job:
 
     Attributes:
         folder: The dataset.
-        plan: Its plan.
+        blueprint: Its plan.
         pipeline: The recipe.
         backend: Which kernels run.
         cache_folder: Where they are cached.
     """
 
     folder: Path
-    plan: DatasetPlan
+    blueprint: Blueprint
     pipeline: Pipeline
     backend: Backend
     cache_folder: Path
 
 
-def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Outcome]]:
+def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Fates]]:
     """Make, check and commit shards of one split; running it twice is harmless.
 
     Args:
@@ -62,13 +62,13 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Out
     """
     started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     prepared = _prepared(job)
-    for task, (columns, outcome) in zip(tasks, shard_columns(prepared, job.plan, tasks), strict=True):
-        found = replace(outcome, verification=spot_check(prepared, columns, job.plan, task))
-        require_plan(job.folder, job.plan)
+    for task, (columns, outcome) in zip(tasks, shard_columns(prepared, job.blueprint, tasks), strict=True):
+        found = replace(outcome, verification=spot_check(prepared, columns, job.blueprint, task))
+        require_plan(job.folder, job.blueprint)
         seconds = round(time.perf_counter() - clock, 3)
         commit_shard(
             job.folder,
-            job.plan,
+            job.blueprint,
             task,
             columns=columns,
             outcome=found,
@@ -81,28 +81,29 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Out
 
 
 def shard_columns(
-    prepared: PreparedPipeline, plan: DatasetPlan, tasks: Sequence[ShardTask]
-) -> Iterator[tuple[dict[str, NDArray[Any]], Outcome]]:
+    prepared: PreparedPipeline, blueprint: Blueprint, tasks: Sequence[ShardTask]
+) -> Iterator[tuple[dict[str, NDArray[Any]], Fates]]:
     """Make the rows of shards of one split from its blocks, each of which is made once.
 
     Args:
         prepared: The stages.
-        plan: The dataset.
+        blueprint: The dataset.
         tasks: The shards, in order.
 
     Yields:
         ``(columns, outcome)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,), and the
         fates of the draws.
     """
-    pieces = _pieces(prepared, plan.seed, tasks)
+    pieces = _pieces(prepared, blueprint.seed, tasks)
     for task in tasks:
         parts: list[Block] = []
         while sum(part.columns["sample_id"].shape[1] for part in parts) < task.rows:
             parts.append(next(pieces))
         columns = {
-            field.name: _stored([part.columns[field.name] for part in parts], field, plan) for field in plan.fields
+            field.name: _stored([part.columns[field.name] for part in parts], field, blueprint)
+            for field in blueprint.fields
         }
-        yield columns, merge_outcomes([part.outcome for part in parts])
+        yield columns, merge_fates([part.outcome for part in parts])
 
 
 def _pieces(prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]) -> Iterator[Block]:
@@ -124,14 +125,14 @@ def blocks_of(task: ShardTask, size: int) -> range:
     return range(task.first_row // size, (task.first_row + task.rows - 1) // size + 1)
 
 
-def _stored(parts: list[NDArray[Any]], field: Field, plan: DatasetPlan) -> NDArray[Any]:
+def _stored(parts: list[NDArray[Any]], field: Field, blueprint: Blueprint) -> NDArray[Any]:
     """Join pieces of shape (width, rows) to what is stored of a field, shape (rows, width) or (rows,)."""
     rows = np.concatenate(parts, axis=1).T
-    return np.ascontiguousarray(rows if field.width else rows[:, 0], storage_dtype(field, plan.dtype))
+    return np.ascontiguousarray(rows if field.width else rows[:, 0], storage_dtype(field, blueprint.dtype))
 
 
 def spot_check(
-    prepared: PreparedPipeline, columns: dict[str, NDArray[Any]], plan: DatasetPlan, task: ShardTask
+    prepared: PreparedPipeline, columns: dict[str, NDArray[Any]], blueprint: Blueprint, task: ShardTask
 ) -> dict[str, float]:
     """Recompute some rows with Pinocchio and Coal: a wrong compiler must not get a shard past this point.
 
@@ -145,12 +146,12 @@ def spot_check(
 
     rows = np.unique(np.linspace(0, task.rows - 1, SPOT_CHECKS).astype(int))
     some = {name: values[rows] for name, values in columns.items()}
-    report = verify_rows(prepared.context.problem, prepared.context.robot, some, dtype=plan.dtype)
+    report = verify_rows(prepared.context.problem, prepared.context.robot, some, dtype=blueprint.dtype)
     if len(report.out):
         wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)
         raise MachineError(
             f"row {task.first_row + rows[report.out[0]]} of split {task.split!r} fails Pinocchio's check ({wrong}):"
-            f" the {plan.backend!r} backend computes wrong numbers on this machine; try another --backend"
+            f" the {blueprint.backend!r} backend computes wrong numbers on this machine; try another --backend"
         )
     return {check.name: check.worst for check in report.checks}
 
@@ -160,10 +161,10 @@ _PREPARED: dict[str, PreparedPipeline] = {}
 
 def _prepared(job: Job) -> PreparedPipeline:
     """Load the stages once per process."""
-    key = f"{job.plan.fingerprint} {job.cache_folder}"
+    key = f"{job.blueprint.fingerprint} {job.cache_folder}"
     if key not in _PREPARED:
         _PREPARED.clear()
         _PREPARED[key] = PreparedPipeline(
-            job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.plan.dtype
+            job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype
         )
     return _PREPARED[key]

@@ -9,7 +9,7 @@ import numpy as np
 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import sample_tops
-from cnpgen.pipelines.stages.stage import Array, Batch, Run
+from cnpgen.pipelines.stages.stage import Array, Round, Work
 from cnpgen.problems.constraints.constraint import EXACTNESS, End
 from cnpgen.problems.problem import Problem
 from cnpgen.store.field import Field
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ROUNDING = 1e-14  # m/s: of a velocity that ought to be zero
 
 
-def acceptance(context: Context, written: set[str]) -> Run:
+def acceptance(context: Context, written: set[str]) -> Work:
     """Prepare the gate.
 
     Args:
@@ -44,7 +44,7 @@ def acceptance(context: Context, written: set[str]) -> Run:
     reasons = [constraint.reason for constraint in context.problem.constraint]
     n = context.robot.n
 
-    def run(batch: Batch, _random: np.random.Generator) -> None:
+    def run(batch: Round, _random: np.random.Generator) -> None:
         tops = sample_tops(context.problem, batch)
         unmet = []
         for end in ends:

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.pipelines.stages.stage import Batch
+from cnpgen.pipelines.stages.stage import Round
 from cnpgen.pipelines.tally import Tally
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import Outcome
+from cnpgen.store.outcome import Fates
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Block:
     """
 
     columns: dict[str, NDArray[Any]]
-    outcome: Outcome
+    outcome: Fates
 
 
 class Piece:
@@ -40,7 +40,7 @@ class Piece:
         self._tally = Tally(fields)
         self._parts: list[dict[str, NDArray[Any]]] = []
 
-    def take(self, batch: Batch, made: int) -> bool:
+    def take(self, batch: Round, made: int) -> bool:
         """Take what belongs to the piece from a round.
 
         Args:

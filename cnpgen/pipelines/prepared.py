@@ -13,7 +13,7 @@ from cnpgen.pipelines.acceptance import acceptance, bookkeeping_fields
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.piece import Block, Piece
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.stage import Array, Batch, Run
+from cnpgen.pipelines.stages.stage import Array, Round, Work
 from cnpgen.problems.constraints.constraint import EXACTNESS
 from cnpgen.problems.problem import problem_identity
 from cnpgen.problems.robot import load_robot
@@ -103,8 +103,8 @@ class PreparedPipeline:
             if waiting:
                 self._check_hope(batch, made, tried)
 
-    def _round(self, random: np.random.Generator, size: int) -> Batch:
-        batch = Batch(size)
+    def _round(self, random: np.random.Generator, size: int) -> Round:
+        batch = Round(size)
         for label, run in self._stages:
             batch.stage = label
             run(batch, random)
@@ -129,7 +129,7 @@ class PreparedPipeline:
         missing = (rows - made) * tried / made
         return int(np.clip(np.ceil(1.03 * missing) + rows // 128, rows // 16, 2 * rows))
 
-    def _check_hope(self, batch: Batch, made: int, tried: int) -> None:
+    def _check_hope(self, batch: Round, made: int, tried: int) -> None:
         if tried >= FAIR_CHANCE and made < HOPELESS * tried:
             counts = np.bincount(batch.fate, minlength=1 + len(batch.reasons))[1:]
             worst = sorted(zip(counts.tolist(), batch.reasons, strict=True), reverse=True)[:3]
@@ -157,7 +157,7 @@ def as_stored(values: Array, field: Field) -> Array:
     return rounded.astype(np.float64)
 
 
-def _prepare(pipeline: Pipeline, context: Context) -> list[tuple[str, Run]]:
+def _prepare(pipeline: Pipeline, context: Context) -> list[tuple[str, Work]]:
     """Prepare and label every stage; raise all their mistakes at once, each with file and stage."""
     runs, mistakes = [], []
     for number, stage in enumerate(pipeline.stage, start=1):

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.pipelines.stages.stage import Array, Batch
+from cnpgen.pipelines.stages.stage import Array, Round
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import DensityMap, Outcome
+from cnpgen.store.outcome import DensityMap, Fates
 
 CELLS = 24  # along each side of a density map
 
@@ -31,7 +31,7 @@ class Tally:
         self._drawn = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
         self._kept = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
 
-    def count(self, batch: Batch, taken: NDArray[np.intp], *, first: int, last: bool) -> NDArray[np.int64]:
+    def count(self, batch: Round, taken: NDArray[np.intp], *, first: int, last: bool) -> NDArray[np.int64]:
         """Count the draws of a finished round that belong to the rows asked for.
 
         Args:
@@ -62,7 +62,7 @@ class Tally:
         self._waiting = stop - 1 - int(wanted[-1]) if len(wanted) else self._waiting + stop - start
         return attempts
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> Fates:
         """Return the counts as they stand."""
         maps = {}
         for field in self._maps:
@@ -71,7 +71,7 @@ class Tally:
             shape = (CELLS, CELLS)
             (x, y), drawn, kept = _extent(field), self._drawn[field.name], self._kept[field.name]
             maps[field.name] = DensityMap(x, y, drawn.reshape(shape), kept.reshape(shape))
-        return Outcome(
+        return Fates(
             tried=self.tried,
             accepted=self.accepted,
             rejections=self._rejections,

@@ -21,7 +21,7 @@ from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.load import problem_of
+from cnpgen.problems.load import as_problem
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem, problem_identity
 from cnpgen.problems.robot import load_robot
@@ -66,7 +66,7 @@ class Omega:
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
-        self.problem, self._scale = problem_of(problem), number("path_scale", path_scale)
+        self.problem, self._scale = as_problem(problem), number("path_scale", path_scale)
         self._bending = integer("bending_steps", bending_steps, least=0)
         self._landed = integer("landing_steps", landing_steps, least=0)
         spec = self.problem.trajectory

@@ -10,7 +10,7 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
 from cnpgen.planner.requests import ASKED, CONTEXT, Requests, boundary_in, check_drawing, check_problem
 from cnpgen.plans.load import stored_problem
-from cnpgen.store.blueprint import load_plan
+from cnpgen.store.blueprint import load_blueprint
 from cnpgen.store.files.hdf5 import opened_foreign_hdf5
 from cnpgen.store.paths import require_file
 from cnpgen.store.shard import FORMAT
@@ -58,7 +58,7 @@ def _text(value: Any) -> str:
 def _check_shard(path: Path, said: Mapping[str, str], model: Model, *, other: bool) -> None:
     """Check a shard by the plan of its dataset; one that was taken out of it, by the digest of its recipe."""
     try:
-        plan = load_plan(path.absolute().parents[1])
+        plan = load_blueprint(path.absolute().parents[1])
     except (DatasetError, IndexError):
         plan = None
     if plan is not None and plan.fingerprint == said.get("plan_fingerprint"):

@@ -14,7 +14,7 @@ from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.record import ProblemRecord
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.trajectory.boundary import Boundary
@@ -59,15 +59,15 @@ def read_rows(
         UsageError: There are no such rows.
     """
     dataset = open_dataset(folder)
-    check_drawing(str(folder), dataset.plan, model, other=other)
-    if split not in dataset.plan.splits:
-        raise UsageError(f"{folder} has no split {split!r}{nearest(split, dataset.plan.splits)}")
-    rows = dataset.plan.splits[split]
+    check_drawing(str(folder), dataset.blueprint, model, other=other)
+    if split not in dataset.blueprint.splits:
+        raise UsageError(f"{folder} has no split {split!r}{nearest(split, dataset.blueprint.splits)}")
+    rows = dataset.blueprint.splits[split]
     stop = rows if n is None else first + n
     if not 0 <= first < stop <= rows:
         wanted = f"{max(stop - first, 1)} from row {first} on"
         raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {wanted}")
-    known = {each.name for each in dataset.plan.fields}
+    known = {each.name for each in dataset.blueprint.fields}
     names = [name for name in ASKED if name in known]
     found = dataset.read(split, fields=names, start=first, stop=stop)
     columns = {name: np.asarray(found[name], np.float64) for name in CONTEXT if name in found}
@@ -75,9 +75,11 @@ def read_rows(
     return Requests(boundary, found.get("sample_id", np.arange(first, stop)), columns)
 
 
-def problem_of(plan: DatasetPlan) -> ProblemRecord:
+def record_of(blueprint: Blueprint) -> ProblemRecord:
     """Return the problem of a dataset."""
-    return ProblemRecord(json.dumps(plan.recipe["pipeline"]["problem"], ensure_ascii=False), str(plan.robot["urdf"]))
+    return ProblemRecord(
+        json.dumps(blueprint.recipe["pipeline"]["problem"], ensure_ascii=False), str(blueprint.robot["urdf"])
+    )
 
 
 def boundary_in(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
@@ -109,11 +111,11 @@ def _drawing(stages: Iterable[Mapping[str, Any]]) -> str:
     return canonical_sha256([stage for stage in stages if stage.get("use") != CERTIFIED])
 
 
-def check_drawing(where: str, plan: DatasetPlan, model: Model, *, other: bool) -> None:
+def check_drawing(where: str, blueprint: Blueprint, model: Model, *, other: bool) -> None:
     """Refuse rows of another problem, and if not ``other`` those drawn in another way than the training rows."""
-    check_problem(where, problem_of(plan), model)
+    check_problem(where, record_of(blueprint), model)
     trained = model.training.get("stages")
-    if other or trained is None or _drawing(trained) == _drawing(plan.recipe["pipeline"]["stage"]):
+    if other or trained is None or _drawing(trained) == _drawing(blueprint.recipe["pipeline"]["stage"]):
         return
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(

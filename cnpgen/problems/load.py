@@ -30,7 +30,7 @@ def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -
     return load_recipe(("problem",), name_or_path, relative_to, read_problem)
 
 
-def problem_of(problem: object) -> Problem:
+def as_problem(problem: object) -> Problem:
     """Return the problem that is meant: itself, or what its name or file says.
 
     Raises:

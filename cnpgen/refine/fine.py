@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import BoundsTemplate, Tightening
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.transcription import Stage, Transcription, of_last
+from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, of_last
 from cnpgen.refine.task import Task
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class FineCheck:
         equalities: Names of the conditions that allow one value only.
     """
 
-    def __init__(self, problem: Problem, world: "World", stage: Stage) -> None:
+    def __init__(self, problem: Problem, world: "World", stage: ResidualKernels) -> None:
         self._grid = make_grid(stage.spec, POINTS)
         self._last = of_last(lambda task: Transcription(stage, self._grid, boundary=task.boundary, tops=task.tops))
         none = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)

@@ -18,7 +18,7 @@ from cnpgen.refine.solver.criterion import Criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT, Result, Settings, minimise
-from cnpgen.refine.solver.transcription import Stage, Transcription
+from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Attempt, Outcome, Task
 from cnpgen.trajectory.spec import TrajectorySpec
 
@@ -116,7 +116,9 @@ class Refiner:
         self._minimise = minimise if solver == "own" else partial(minimise_with, solver=solver)
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
-        self.stage = Stage(self.spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals)
+        self.stage = ResidualKernels(
+            self.spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals
+        )
         self.passes = default_passes(problem, settings) if passes is None else passes
         self.check = FineCheck(problem, world, self.stage)
         self._grids = {points: make_grid(self.spec, points) for points in {each.points for each in self._every}}

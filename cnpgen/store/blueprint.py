@@ -46,7 +46,7 @@ class ShardTask:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetPlan:
+class Blueprint:
     """What a dataset will hold.
 
     Attributes:
@@ -116,23 +116,23 @@ class DatasetPlan:
         return by_name[name]
 
 
-def _check_sizes(plan: DatasetPlan) -> None:
-    if plan.block_rows < 1 or plan.shard_size < 1:
-        raise UsageError(f"the shard size must be at least 1, got {plan.shard_size}")
-    if plan.seed < 0:
-        raise UsageError(f"the seed must not be negative, got {plan.seed}")
-    if plan.dtype not in {"float64", "float32"}:
-        raise UsageError(f"dtype must be 'float64' or 'float32', got {plan.dtype!r}")
-    if any(rows < 0 for rows in plan.splits.values()) or not any(plan.splits.values()):
-        found = ", ".join(f"{name} {rows}" for name, rows in plan.splits.items())
+def _check_sizes(blueprint: Blueprint) -> None:
+    if blueprint.block_rows < 1 or blueprint.shard_size < 1:
+        raise UsageError(f"the shard size must be at least 1, got {blueprint.shard_size}")
+    if blueprint.seed < 0:
+        raise UsageError(f"the seed must not be negative, got {blueprint.seed}")
+    if blueprint.dtype not in {"float64", "float32"}:
+        raise UsageError(f"dtype must be 'float64' or 'float32', got {blueprint.dtype!r}")
+    if any(rows < 0 for rows in blueprint.splits.values()) or not any(blueprint.splits.values()):
+        found = ", ".join(f"{name} {rows}" for name, rows in blueprint.splits.items())
         raise UsageError(f"the splits must have rows, got {found or 'none'}")
 
 
-def _check_names(plan: DatasetPlan) -> None:
-    for split in plan.splits:
+def _check_names(blueprint: Blueprint) -> None:
+    for split in blueprint.splits:
         if not SPLIT_NAME.fullmatch(split):
             raise UsageError(f"a split is named with letters, digits and '_', starting with a letter; got {split!r}")
-    names = [item.name for item in plan.fields]
+    names = [item.name for item in blueprint.fields]
     if not names or len(set(names)) != len(names):
         raise UsageError(f"the fields must have different names, got {names}")
 
@@ -151,52 +151,52 @@ def default_shard_size(rows: int, block_rows: int = 4096) -> int:
     return int(min(max(1 << max(round(math.log2(max(rows, 1) / 16)), 0), low), high))
 
 
-def shards(plan: DatasetPlan) -> list[ShardTask]:
+def shards(blueprint: Blueprint) -> list[ShardTask]:
     """List the shards of a plan, split by split, in order; a split without rows has none."""
     return [
-        ShardTask(split, index, first, min(plan.shard_size, rows - first))
-        for split, rows in plan.splits.items()
-        for index, first in enumerate(range(0, rows, plan.shard_size))
+        ShardTask(split, index, first, min(blueprint.shard_size, rows - first))
+        for split, rows in blueprint.splits.items()
+        for index, first in enumerate(range(0, rows, blueprint.shard_size))
     ]
 
 
-def shard_attributes(plan: DatasetPlan, task: ShardTask) -> dict[str, str | int]:
+def shard_attributes(blueprint: Blueprint, task: ShardTask) -> dict[str, str | int]:
     """Say what a shard's file says about itself; no time, host or path, so that its bytes depend on the plan alone."""
     return {
-        "dataset": plan.name,
-        "dataset_version": plan.version,
+        "dataset": blueprint.name,
+        "dataset_version": blueprint.version,
         "split": task.split,
         "shard_index": task.index,
         "first_sample_id": task.first_row,
         "rows": task.rows,
-        "recipe_sha256": plan.recipe_sha256,
-        "plan_fingerprint": plan.fingerprint,
-        "plan_key": plan.key,
-        "root_seed": str(plan.seed),
-        "generator": plan.generator,
-        "backend": plan.backend,
-        "cnpgen_version": plan.versions.get("cnpgen", ""),
+        "recipe_sha256": blueprint.recipe_sha256,
+        "plan_fingerprint": blueprint.fingerprint,
+        "plan_key": blueprint.key,
+        "root_seed": str(blueprint.seed),
+        "generator": blueprint.generator,
+        "backend": blueprint.backend,
+        "cnpgen_version": blueprint.versions.get("cnpgen", ""),
     }
 
 
-def to_json(plan: DatasetPlan) -> dict[str, Any]:
+def to_json(blueprint: Blueprint) -> dict[str, Any]:
     """Return the plan as a JSON-able dict."""
-    names = [name for name in DatasetPlan.__dataclass_fields__ if name not in {"fields", "seed"}]
-    content = {"seed": str(plan.seed), "fields": [asdict(item) for item in plan.fields]}
-    return {name: getattr(plan, name) for name in names} | {name: plain(value) for name, value in content.items()}
+    names = [name for name in Blueprint.__dataclass_fields__ if name not in {"fields", "seed"}]
+    content = {"seed": str(blueprint.seed), "fields": [asdict(item) for item in blueprint.fields]}
+    return {name: getattr(blueprint, name) for name in names} | {name: plain(value) for name, value in content.items()}
 
 
-def from_json(content: Mapping[str, Any]) -> DatasetPlan:
+def from_json(content: Mapping[str, Any]) -> Blueprint:
     """Rebuild a plan from :func:`to_json`'s dict.
 
     Raises:
         DatasetError: A key is missing or has the wrong type.
     """
     try:
-        arguments = {name: content[name] for name in DatasetPlan.__dataclass_fields__}
+        arguments = {name: content[name] for name in Blueprint.__dataclass_fields__}
         arguments["seed"] = int(content["seed"])
         arguments["fields"] = tuple(_field(item) for item in content["fields"])
-        return DatasetPlan(**arguments)
+        return Blueprint(**arguments)
     except (KeyError, TypeError, ValueError, AttributeError, UsageError) as error:
         raise DatasetError(f"the plan is damaged: {type(error).__name__} {error}") from error
 
@@ -209,8 +209,8 @@ def _field(content: Mapping[str, Any]) -> Field:
     return Field(**{**content, "names": tuple(content["names"]), **limits})
 
 
-def save_plan(folder: Path, plan: DatasetPlan) -> None:
-    """Write ``plan.json``; a folder that holds the same plan already is left as it is.
+def save_plan(folder: Path, blueprint: Blueprint) -> None:
+    """Write ``blueprint.json``; a folder that holds the same plan already is left as it is.
 
     Raises:
         DatasetError: The folder holds another dataset, or something else.
@@ -218,26 +218,26 @@ def save_plan(folder: Path, plan: DatasetPlan) -> None:
     """
     path = folder / PLAN
     if path.exists():
-        if load_plan(folder).fingerprint != plan.fingerprint:
+        if load_blueprint(folder).fingerprint != blueprint.fingerprint:
             raise DatasetError(f"{folder} holds another dataset (its plan differs): choose another folder or remove it")
         return
     if folder.is_dir() and any(item.name != WORK for item in folder.iterdir()):
         raise DatasetError(f"{folder} is not empty and holds no dataset: choose another folder or empty it")
-    write_plan(folder, plan)
+    write_plan(folder, blueprint)
 
 
-def write_plan(folder: Path, plan: DatasetPlan) -> None:
-    """Write ``plan.json``, whatever was there.
+def write_plan(folder: Path, blueprint: Blueprint) -> None:
+    """Write ``blueprint.json``, whatever was there.
 
     Raises:
         MachineError: The folder cannot be written.
     """
-    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "fingerprint": plan.fingerprint}
-    save_document(folder / PLAN, document | to_json(plan), work=folder / WORK)
+    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "fingerprint": blueprint.fingerprint}
+    save_document(folder / PLAN, document | to_json(blueprint), work=folder / WORK)
 
 
-def load_plan(folder: Path) -> DatasetPlan:
-    """Read ``plan.json``.
+def load_blueprint(folder: Path) -> Blueprint:
+    """Read ``blueprint.json``.
 
     Raises:
         DatasetError: It is missing, damaged or written by a newer cnpgen.
@@ -245,7 +245,7 @@ def load_plan(folder: Path) -> DatasetPlan:
     """
     path = folder / PLAN
     document = load_document(path, FORMAT, version=FORMAT_VERSION)
-    plan = from_json(document)
-    if plan.fingerprint != document.get("fingerprint"):
+    blueprint = from_json(document)
+    if blueprint.fingerprint != document.get("fingerprint"):
         raise DatasetError(f"{path} is damaged: its fingerprint does not match its content")
-    return plan
+    return blueprint

@@ -67,17 +67,17 @@ def card_text(summary: Summary, *, folder: str, notes: str = "") -> str:
         folder: Name of the dataset's folder.
         notes: Text about the dataset to include, Markdown.
     """
-    plan = summary.plan
+    blueprint = summary.blueprint
     split = next(iter(summary.statistics))
     sections = [
         _front_matter(summary),
-        f"# {plan.name} {plan.version}\n\n{plan.title or plan.name}\n\n{_contents(summary)}",
+        f"# {blueprint.name} {blueprint.version}\n\n{blueprint.title or blueprint.name}\n\n{_contents(summary)}",
         notes.strip(),
         f"## How it was made\n\n{_making(summary)}",
         f"## How to load it\n\n{_LOAD.replace('SPLIT', split).replace('FOLDER', folder)}",
-        f"## Fields\n\n{_field_table(plan.fields)}",
+        f"## Fields\n\n{_field_table(blueprint.fields)}",
         f"## Yield\n\n{_yield_table(summary)}",
-        f"## Ranges ({split})\n\n{_range_table(plan.fields, summary.statistics[split])}",
+        f"## Ranges ({split})\n\n{_range_table(blueprint.fields, summary.statistics[split])}",
         f"## How to verify it\n\n{_VERIFY}",
     ]
     return "\n\n".join(section.strip() for section in sections if section) + "\n"
@@ -85,22 +85,22 @@ def card_text(summary: Summary, *, folder: str, notes: str = "") -> str:
 
 def _front_matter(summary: Summary) -> str:
     """Write the YAML that makes the folder a dataset of Hugging Face; JSON strings are YAML strings."""
-    plan = summary.plan
-    rows = sum(plan.splits.values())
+    blueprint = summary.blueprint
+    rows = sum(blueprint.splits.values())
     size = next((name for limit, name in _SIZES if rows < limit), "n>1B")
-    lines = [f"license: {json.dumps(plan.license.lower())}"] if plan.license else []
-    lines += [f"pretty_name: {json.dumps(plan.title or plan.name, ensure_ascii=False)}"]
+    lines = [f"license: {json.dumps(blueprint.license.lower())}"] if blueprint.license else []
+    lines += [f"pretty_name: {json.dumps(blueprint.title or blueprint.name, ensure_ascii=False)}"]
     lines += ["task_categories:", "- robotics", "tags:", "- robotics", "- motion-planning", "- trajectory-optimization"]
     lines += ["- cnpgen", "size_categories:", f'- "{size}"', "configs:", "- config_name: default", "  data_files:"]
-    for split, count in plan.splits.items():
+    for split, count in blueprint.splits.items():
         if count:
             lines += [f"  - split: {split}", f'    path: "{split}/*.h5"']
     return "\n".join(["---", *lines, "---"])
 
 
 def _contents(summary: Summary) -> str:
-    plan = summary.plan
-    rows = [(f"`{split}`", f"{count:,}", len(summary.of_split(split))) for split, count in plan.splits.items()]
+    blueprint = summary.blueprint
+    rows = [(f"`{split}`", f"{count:,}", len(summary.of_split(split))) for split, count in blueprint.splits.items()]
     proven = (
         "Every row passed every stage of its pipeline; the problem's constraints were evaluated on the stored numbers."
     )
@@ -108,16 +108,16 @@ def _contents(summary: Summary) -> str:
 
 
 def _making(summary: Summary) -> str:
-    plan = summary.plan
+    blueprint = summary.blueprint
     facts = {
-        "recipe": f"sha256 `{plan.recipe_sha256}`, in full in `manifest.json`",
-        "robot": str(plan.robot.get("name", "")),
-        "seed": str(plan.seed),
-        "random numbers": plan.generator,
-        "kernels": plan.backend,
-        "stored as": plan.dtype,
-        "plan": f"fingerprint `{plan.fingerprint}`",
-        "made with": ", ".join(f"{name} {version}" for name, version in plan.versions.items()),
+        "recipe": f"sha256 `{blueprint.recipe_sha256}`, in full in `manifest.json`",
+        "robot": str(blueprint.robot.get("name", "")),
+        "seed": str(blueprint.seed),
+        "random numbers": blueprint.generator,
+        "kernels": blueprint.backend,
+        "stored as": blueprint.dtype,
+        "plan": f"fingerprint `{blueprint.fingerprint}`",
+        "made with": ", ".join(f"{name} {version}" for name, version in blueprint.versions.items()),
     }
     lines = [f"- {name}: {value}" for name, value in facts.items() if value]
     return (

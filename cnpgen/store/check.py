@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shard_attributes, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shard_attributes, shards
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
@@ -72,30 +72,30 @@ def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) ->
         MachineError: The system would not let us read something.
     """
     try:
-        plan = load_plan(folder)
+        blueprint = load_blueprint(folder)
     except DatasetError as error:
         return [Finding(PLAN, _reason(error, folder / PLAN), advice=REPLACE)]
-    findings, manifest = _check_manifest(folder, plan)
+    findings, manifest = _check_manifest(folder, blueprint)
     entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
-    for task in shards(plan):
+    for task in shards(blueprint):
         entry = entries.get(task.file)
         if finished or (folder / task.sidecar).exists():
             progress(task.file)
-            findings += check_shard(folder, plan, task, entry)
-    return findings + list(_extras(folder, plan))
+            findings += check_shard(folder, blueprint, task, entry)
+    return findings + list(_extras(folder, blueprint))
 
 
-def check_documents(folder: Path, plan: DatasetPlan) -> list[Finding]:
+def check_documents(folder: Path, blueprint: Blueprint) -> list[Finding]:
     """Check what sums up a finished dataset: the manifest, the files it lists and the sidecars; no shard is read.
 
     Args:
         folder: The dataset's folder.
-        plan: Its plan.
+        blueprint: Its plan.
 
     Raises:
         MachineError: The system would not let us read something.
     """
-    findings, manifest = _check_manifest(folder, plan)
+    findings, manifest = _check_manifest(folder, blueprint)
     for entry in _shard_entries(manifest).values():
         findings += _check_digest(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
     return findings
@@ -106,20 +106,20 @@ def _reason(error: DatasetError, path: Path) -> str:
     return str(error).removeprefix(f"{path} ").removeprefix(f"{path}: ")
 
 
-def _check_manifest(folder: Path, plan: DatasetPlan) -> tuple[list[Finding], dict[str, Any]]:
+def _check_manifest(folder: Path, blueprint: Blueprint) -> tuple[list[Finding], dict[str, Any]]:
     """Check the manifest and the files it lists; return it empty if it cannot be relied upon."""
     if not (folder / MANIFEST).exists():
-        summary = summarise(folder, plan, allow_partial=True)
+        summary = summarise(folder, blueprint, allow_partial=True)
         return [Finding(MANIFEST, f"is missing: the dataset is {unfinished(summary)}", advice=MAKE_AGAIN)], {}
     try:
         manifest = load_manifest(folder)
     except DatasetError as error:
         return [Finding(MANIFEST, _reason(error, folder / MANIFEST), advice=MAKE_AGAIN)], {}
-    if manifest["plan_fingerprint"] != plan.fingerprint:
+    if manifest["plan_fingerprint"] != blueprint.fingerprint:
         return [Finding(MANIFEST, "is of another plan than plan.json", advice=MAKE_AGAIN)], {}
     entries = _shard_entries(manifest)
     findings = []
-    if entries.keys() != {task.file for task in shards(plan)}:
+    if entries.keys() != {task.file for task in shards(blueprint)}:
         findings.append(Finding(MANIFEST, "lists other shards than the plan", advice=MAKE_AGAIN))
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
         findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", advice=MAKE_AGAIN))
@@ -141,12 +141,14 @@ def _check_digest(folder: Path, name: str, sha256: str) -> list[Finding]:
     return []
 
 
-def check_shard(folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[str, Any] | None = None) -> list[Finding]:
+def check_shard(
+    folder: Path, blueprint: Blueprint, task: ShardTask, entry: dict[str, Any] | None = None
+) -> list[Finding]:
     """Check one shard and its sidecar.
 
     Args:
         folder: The dataset's folder.
-        plan: Its plan.
+        blueprint: Its plan.
         task: Which shard.
         entry: What the manifest says about it, if there is one.
 
@@ -157,15 +159,15 @@ def check_shard(folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[st
         MachineError: The system would not let us read it.
     """
     path = folder / task.file
-    findings, expected = _check_sidecar(folder, plan, task, entry)
+    findings, expected = _check_sidecar(folder, blueprint, task, entry)
     if not path.is_file():
         return [*findings, Finding(task.file, "is missing", advice=MAKE_AGAIN)]
     if expected is None:  # nobody knows what the file should be, and findings says why
         return findings
     damage = _check_file(folder, task.file, *expected)
-    if damage and not _is_of_another_plan(path, plan):
+    if damage and not _is_of_another_plan(path, blueprint):
         return findings + damage  # what HDF5 makes of a damaged file tells nothing, and may take forever
-    content = check_content(folder, plan, task)
+    content = check_content(folder, blueprint, task)
     if findings or damage:  # then make-dataset notices by itself that the shard is not the one that it made
         content = [replace(finding, advice=MAKE_AGAIN) for finding in content]
     return findings + damage + content
@@ -179,16 +181,16 @@ def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding
     return _check_digest(folder, name, sha256)
 
 
-def _is_of_another_plan(path: Path, plan: DatasetPlan) -> bool:
+def _is_of_another_plan(path: Path, blueprint: Blueprint) -> bool:
     """Whether a shard that is not the recorded one is a sound shard of another plan."""
     try:
-        return read_attributes(path, ["plan_key"])["plan_key"] != plan.key
+        return read_attributes(path, ["plan_key"])["plan_key"] != blueprint.key
     except DatasetError:
         return False
 
 
 def _check_sidecar(
-    folder: Path, plan: DatasetPlan, task: ShardTask, entry: dict[str, Any] | None
+    folder: Path, blueprint: Blueprint, task: ShardTask, entry: dict[str, Any] | None
 ) -> tuple[list[Finding], tuple[int, str] | None]:
     """Check a sidecar; return also the size and digest that the shard should have, as far as somebody knows."""
     expected = None if entry is None else (entry["bytes"], entry["sha256"])
@@ -197,18 +199,18 @@ def _check_sidecar(
     except DatasetError as error:
         return [Finding(task.sidecar, _reason(error, folder / task.sidecar), advice=MAKE_AGAIN)], expected
     findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
-    if record.plan_fingerprint != plan.fingerprint:
+    if record.plan_fingerprint != blueprint.fingerprint:
         text = f"belongs to another plan ({record.plan_fingerprint[:12]}...)"
         findings.append(Finding(task.sidecar, text, advice=MAKE_AGAIN))
     return findings, expected or (record.bytes, record.sha256)
 
 
-def check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Finding]:
+def check_content(folder: Path, blueprint: Blueprint, task: ShardTask) -> list[Finding]:
     """Compare what a shard says about itself with the plan.
 
     Args:
         folder: The dataset's folder.
-        plan: Its plan.
+        blueprint: Its plan.
         task: Which shard; its file should be known to be as it was written (see :func:`read_attributes`).
 
     Returns:
@@ -219,25 +221,25 @@ def check_content(folder: Path, plan: DatasetPlan, task: ShardTask) -> list[Find
         attributes, schema = read_attributes(path), read_schema(path)
     except DatasetError as error:
         return [Finding(task.file, _reason(error, path), advice=DELETE)]
-    expected = {"format": FORMAT, "format_version": FORMAT_VERSION, **shard_attributes(plan, task)}
+    expected = {"format": FORMAT, "format_version": FORMAT_VERSION, **shard_attributes(blueprint, task)}
     problems = [
         f"its {name} is {attributes.get(name)!r}, the plan says {value!r}"
         for name, value in expected.items()
         if attributes.get(name) != value
     ]
-    names = {field.name for field in plan.fields}
+    names = {field.name for field in blueprint.fields}
     problems += [f"lacks the field {name!r}" for name in sorted(names - schema.keys())]
     problems += [f"has an unknown field {name!r}" for name in sorted(schema.keys() - names)]
-    for field in plan.fields:
+    for field in blueprint.fields:
         if field.name in schema:
-            problems += _check_field(field, schema[field.name], plan, task)
+            problems += _check_field(field, schema[field.name], blueprint, task)
     return [Finding(task.file, problem, advice=DELETE) for problem in problems]
 
 
-def _check_field(field: Field, found: StoredField, plan: DatasetPlan, task: ShardTask) -> list[str]:
+def _check_field(field: Field, found: StoredField, blueprint: Blueprint, task: ShardTask) -> list[str]:
     """Compare what a shard says about a field with the plan."""
     shape = (task.rows, field.width) if field.width else (task.rows,)
-    dtype = storage_dtype(field, plan.dtype)
+    dtype = storage_dtype(field, blueprint.dtype)
     problems = []
     if found.shape != shape or found.dtype != dtype:
         problems.append(f"field {field.name!r} is {found.dtype} of shape {found.shape}, not {dtype} of shape {shape}")
@@ -253,12 +255,12 @@ def _check_field(field: Field, found: StoredField, plan: DatasetPlan, task: Shar
     ]
 
 
-def _extras(folder: Path, plan: DatasetPlan) -> Iterator[Finding]:
+def _extras(folder: Path, blueprint: Blueprint) -> Iterator[Finding]:
     """Name what does not belong to the dataset, a foreign folder as a whole."""
-    known = {PLAN, MANIFEST, *_LISTED, WORK, *plan.splits}
-    for task in shards(plan):
+    known = {PLAN, MANIFEST, *_LISTED, WORK, *blueprint.splits}
+    for task in shards(blueprint):
         known |= {task.file, task.sidecar}
-    for parent in [folder, *(folder / split for split in plan.splits)]:
+    for parent in [folder, *(folder / split for split in blueprint.splits)]:
         for item in sorted(parent.iterdir()) if parent.is_dir() else ():
             name = item.relative_to(folder).as_posix()
             if name not in known:

@@ -52,27 +52,27 @@ def croissant_document(summary: Summary, *, created: str) -> dict[str, Any]:
         summary: The finished shards.
         created: When the dataset was finished, ISO 8601.
     """
-    plan = summary.plan
+    blueprint = summary.blueprint
     document: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "name": plan.name,
+        "name": blueprint.name,
         "description": _description(summary),
-        "version": plan.version,
+        "version": blueprint.version,
         "datePublished": created,
     }
-    if plan.license:
-        document["license"] = f"https://spdx.org/licenses/{plan.license}"
+    if blueprint.license:
+        document["license"] = f"https://spdx.org/licenses/{blueprint.license}"
     return document | {"distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records]}
 
 
 def _description(summary: Summary) -> str:
     """Say in prose what the record sets would have said."""
-    plan = summary.plan
-    rows = ", ".join(f"{count} {split}" for split, count in plan.splits.items())
-    fields = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in plan.fields)
-    title = plan.title.rstrip(".") or plan.name
+    blueprint = summary.blueprint
+    rows = ", ".join(f"{count} {split}" for split, count in blueprint.splits.items())
+    fields = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in blueprint.fields)
+    title = blueprint.title.rstrip(".") or blueprint.name
     return f"{title}. Rows: {rows}. Every HDF5 file holds one dataset per field, one entry per row: {fields}."
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.blueprint import DatasetPlan, load_plan, shards
+from cnpgen.store.blueprint import Blueprint, load_blueprint, shards
 from cnpgen.store.check import check_documents
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import plain
 from cnpgen.store.layout import DOCUMENTS, MANIFEST, PLAN
-from cnpgen.store.outcome import Outcome, densities_to_json
+from cnpgen.store.outcome import Fates, densities_to_json
 from cnpgen.store.paths import require_folder
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise, unfinished
@@ -38,12 +38,12 @@ class Inspection:
     damage: tuple[str, ...] = ()
 
     @property
-    def plan(self) -> DatasetPlan:
+    def blueprint(self) -> Blueprint:
         """The plan of the dataset."""
-        return self.summary.plan
+        return self.summary.blueprint
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> Fates:
         """The fates of all draws that were made for the rows that are there."""
         return self.summary.outcome
 
@@ -68,7 +68,9 @@ class Inspection:
     @cached_property
     def rows(self) -> dict[str, int]:
         """Rows per split that are there."""
-        return {split: sum(record.rows for _, record in self.summary.of_split(split)) for split in self.plan.splits}
+        return {
+            split: sum(record.rows for _, record in self.summary.of_split(split)) for split in self.blueprint.splits
+        }
 
     @cached_property
     def statistics(self) -> Mapping[str, FieldStatistics]:
@@ -92,23 +94,26 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""
-        plan = self.plan
+        blueprint = self.blueprint
         content = {
             "folder": self.folder,
-            **{name: getattr(plan, name) for name in ("name", "version", "title", "license")},
+            **{name: getattr(blueprint, name) for name in ("name", "version", "title", "license")},
             **{name: getattr(self, name) for name in ("complete", "state", "bytes", "seconds")},
             "damage": [*self.summary.problems, *self.damage] if self.sealed else [],
             "shards": {"planned": self.summary.n_shards, "finished": len(self.summary.records)},
-            "rows": {split: {"planned": plan.splits[split], "stored": rows} for split, rows in self.rows.items()},
-            "fields": [self._field(field) for field in plan.fields],
+            "rows": {split: {"planned": blueprint.splits[split], "stored": rows} for split, rows in self.rows.items()},
+            "fields": [self._field(field) for field in blueprint.fields],
             "yield": _yield(self.outcome),
             "yield_by_split": {split: _yield(outcome) for split, outcome in self.summary.outcomes.items()},
             "densities": densities_to_json(self.outcome.densities),
             "verification": self.outcome.verification,
-            "seed": str(plan.seed),
-            **{name: getattr(plan, name) for name in ("generator", "backend", "dtype", "shard_size", "recipe_sha256")},
-            "plan_fingerprint": plan.fingerprint,
-            "versions": plan.versions,
+            "seed": str(blueprint.seed),
+            **{
+                name: getattr(blueprint, name)
+                for name in ("generator", "backend", "dtype", "shard_size", "recipe_sha256")
+            },
+            "plan_fingerprint": blueprint.fingerprint,
+            "versions": blueprint.versions,
             "environments": self.environments,
         }
         found: dict[str, Any] = plain(content)
@@ -123,7 +128,7 @@ class Inspection:
         return content | {"min": found.minimum, "mean": found.mean, "max": found.maximum, "std": found.std}
 
 
-def _yield(outcome: Outcome) -> dict[str, Any]:
+def _yield(outcome: Fates) -> dict[str, Any]:
     """Return tried, accepted and, in pipeline order, why draws were rejected and how many went on."""
     tried, left, steps = max(outcome.tried, 1), outcome.tried, []
     for reason, count in outcome.rejections.items():
@@ -150,16 +155,16 @@ def inspect_dataset(folder: str | Path) -> Inspection:
     if not is_dataset(folder):
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
     try:
-        plan = load_plan(folder)
+        blueprint = load_blueprint(folder)
     except DatasetError as error:
         raise DatasetError(f"{error}; 'cnpgen validate' says what to do") from error
-    summary = summarise(folder, plan, allow_partial=True)
+    summary = summarise(folder, blueprint, allow_partial=True)
     sealed = (folder / MANIFEST).is_file()
-    damage = tuple(str(finding) for finding in check_documents(folder, plan)) if sealed else ()
-    return Inspection(folder, summary, sealed, _size(folder, plan), damage)
+    damage = tuple(str(finding) for finding in check_documents(folder, blueprint)) if sealed else ()
+    return Inspection(folder, summary, sealed, _size(folder, blueprint), damage)
 
 
-def _size(folder: Path, plan: DatasetPlan) -> int:
+def _size(folder: Path, blueprint: Blueprint) -> int:
     """Add up the files of a dataset, without what else is in its folder [bytes]."""
-    names = [*DOCUMENTS, *(name for task in shards(plan) for name in (task.file, task.sidecar))]
+    names = [*DOCUMENTS, *(name for task in shards(blueprint) for name in (task.file, task.sidecar))]
     return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import DatasetPlan, load_plan
+from cnpgen.store.blueprint import Blueprint, load_blueprint
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
 from cnpgen.store.field import Field
@@ -40,7 +40,7 @@ def finalize(folder: Path, *, notes: str = "") -> dict[str, Any]:
         UsageError: SOURCE_DATE_EPOCH is no time.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    summary = summarise(folder, load_plan(folder))
+    summary = summarise(folder, load_blueprint(folder))
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
@@ -100,22 +100,22 @@ def _created(summary: Summary) -> str:
 
 def _manifest(folder: Path, summary: Summary, *, created: str) -> dict[str, Any]:
     """Build the manifest; the files that it lists must be on the disk."""
-    plan = summary.plan
+    blueprint = summary.blueprint
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "name": plan.name,
-        "version": plan.version,
-        "title": plan.title,
+        "name": blueprint.name,
+        "version": blueprint.version,
+        "title": blueprint.title,
         "created": created,
-        "license": plan.license,
+        "license": blueprint.license,
         "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
-        "plan_fingerprint": plan.fingerprint,
+        "plan_fingerprint": blueprint.fingerprint,
         **_origin(summary),
-        "features": {field.name: _feature(field, plan) for field in plan.fields},
+        "features": {field.name: _feature(field, blueprint) for field in blueprint.fields},
         "yield": summary.outcome.yield_json(),
         "verification": dict(summary.outcome.verification),
-        "splits": {split: _split(folder, summary, split) for split in plan.splits},
+        "splits": {split: _split(folder, summary, split) for split in blueprint.splits},
         "stats": STATS,
         "files": {name: _listed(folder / name) for name in (PLAN, STATS, CARD, CROISSANT)},
     }
@@ -133,33 +133,33 @@ def data_fingerprint(shards: Iterable[tuple[str, str]]) -> str:
 
 def _origin(summary: Summary) -> dict[str, Any]:
     """Say where the rows come from; "environments" are the versions that made them, more than one after an upgrade."""
-    plan = summary.plan
+    blueprint = summary.blueprint
     environments: list[dict[str, str]] = []
     for _, record in summary.records:
         if (versions := dict(record.versions)) not in environments:
             environments.append(versions)
-    pipeline = plan.recipe.get("pipeline")
+    pipeline = blueprint.recipe.get("pipeline")
     return {
         "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
-        "recipe_sha256": plan.recipe_sha256,
-        "recipe": plan.recipe,
-        "seed": str(plan.seed),
-        "generator": plan.generator,
-        "backend": plan.backend,
-        "dtype": plan.dtype,
-        "block_rows": plan.block_rows,
-        "shard_size": plan.shard_size,
-        "robot": plan.robot,
-        "versions": plan.versions,
+        "recipe_sha256": blueprint.recipe_sha256,
+        "recipe": blueprint.recipe,
+        "seed": str(blueprint.seed),
+        "generator": blueprint.generator,
+        "backend": blueprint.backend,
+        "dtype": blueprint.dtype,
+        "block_rows": blueprint.block_rows,
+        "shard_size": blueprint.shard_size,
+        "robot": blueprint.robot,
+        "versions": blueprint.versions,
         "environments": environments,
         "seconds": sum(record.seconds for _, record in summary.records),
     }
 
 
-def _feature(field: Field, plan: DatasetPlan) -> dict[str, Any]:
+def _feature(field: Field, blueprint: Blueprint) -> dict[str, Any]:
     """Describe a field with the keys of LeRobot's ``info.json`` and the units that those lack."""
     return {
-        "dtype": plan.dtype if field.dtype == "float" else field.dtype,
+        "dtype": blueprint.dtype if field.dtype == "float" else field.dtype,
         "shape": [field.width] if field.width else [],
         "names": field.names,
         "units": field.unit,
@@ -185,7 +185,7 @@ def _split(folder: Path, summary: Summary, split: str) -> dict[str, Any]:
         for task, record in summary.of_split(split)
     ]
     outcome = summary.outcomes[split]
-    return {"rows": summary.plan.splits[split], "yield": outcome.yield_json(), "shards": entries}
+    return {"rows": summary.blueprint.splits[split], "yield": outcome.yield_json(), "shards": entries}
 
 
 def _listed(path: Path) -> dict[str, Any]:

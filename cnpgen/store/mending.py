@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.record import check_committed
@@ -26,7 +26,7 @@ def made_already(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]:
 
 def find_damaged(
     folder: Path,
-    plan: DatasetPlan,
+    blueprint: Blueprint,
     tasks: Sequence[ShardTask],
     *,
     progress: Callable[[ShardTask], None] | None = None,
@@ -35,7 +35,7 @@ def find_damaged(
 
     Args:
         folder: The dataset's folder.
-        plan: Its plan.
+        blueprint: Its plan.
         tasks: Shards that were made.
         progress: Called with every shard that was compared.
 
@@ -48,7 +48,7 @@ def find_damaged(
     damaged = {}
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS))  # sha256 runs without Python's lock
     try:
-        for task, problem in zip(tasks, pool.map(partial(_problem, folder, plan.fingerprint), tasks), strict=True):
+        for task, problem in zip(tasks, pool.map(partial(_problem, folder, blueprint.fingerprint), tasks), strict=True):
             if problem:
                 damaged[task] = problem
             if progress is not None:

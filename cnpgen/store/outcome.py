@@ -39,7 +39,7 @@ class DensityMap:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome:
+class Fates:
     """The fates of all draws: ``tried == accepted + sum(rejections)``.
 
     Attributes:
@@ -66,7 +66,7 @@ class Outcome:
             if not math.isfinite(worst):
                 raise DatasetError(f"the worst violation of {name!r} must be a finite number, got {worst}")
 
-    def merge(self, other: "Outcome") -> "Outcome":
+    def merge(self, other: "Fates") -> "Fates":
         """Return the outcome of both sets of draws: counts add up, the worst violation stays."""
         reasons = _merged_order(list(self.rejections), list(other.rejections))
         densities = dict(self.densities)
@@ -75,7 +75,7 @@ class Outcome:
         worst = dict(self.verification)
         for name, value in other.verification.items():
             worst[name] = max(worst.get(name, value), value)
-        return Outcome(
+        return Fates(
             tried=self.tried + other.tried,
             accepted=self.accepted + other.accepted,
             rejections={name: self.rejections.get(name, 0) + other.rejections.get(name, 0) for name in reasons},
@@ -126,9 +126,9 @@ def _density(content: Mapping[str, Any]) -> DensityMap:
     return DensityMap((float(x_low), float(x_high)), (float(y_low), float(y_high)), *counts)
 
 
-def outcome_from_json(content: Mapping[str, Any]) -> Outcome:
+def outcome_from_json(content: Mapping[str, Any]) -> Fates:
     """Rebuild an outcome from its JSON form."""
-    return Outcome(
+    return Fates(
         tried=int(content["tried"]),
         accepted=int(content["accepted"]),
         rejections={name: int(count) for name, count in content["rejections"].items()},
@@ -138,9 +138,9 @@ def outcome_from_json(content: Mapping[str, Any]) -> Outcome:
     )
 
 
-def merge_outcomes(parts: Sequence[Outcome]) -> Outcome:
+def merge_fates(parts: Sequence[Fates]) -> Fates:
     """Merge the outcomes of shards, in the given order; without any, nothing was tried."""
-    merged = Outcome(tried=0, accepted=0)
+    merged = Fates(tried=0, accepted=0)
     for part in parts:
         merged = merged.merge(part)
     return merged

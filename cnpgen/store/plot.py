@@ -45,8 +45,10 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
     joints = _joint_fields(inspection)
     heights = [1.3 * len(joints) + 0.3, 4.2]
     figure = Figure(figsize=(14, sum(heights) + 0.5), layout="constrained", dpi=110)
-    plan = inspection.plan
-    figure.suptitle(f"{plan.name} {plan.version}, {sum(inspection.rows.values()):,} rows ({inspection.state})")
+    blueprint = inspection.blueprint
+    figure.suptitle(
+        f"{blueprint.name} {blueprint.version}, {sum(inspection.rows.values()):,} rows ({inspection.state})"
+    )
     parts = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)
     _draw_histograms(parts[0, 0], joints, inspection.statistics)
     _draw_task_space(parts[1, 0], inspection)
@@ -62,9 +64,11 @@ def _save(figure: "Figure", path: Path) -> None:
 
 def _joint_fields(inspection: Inspection) -> list[Field]:
     """Return the fields with one column per joint and a histogram."""
-    joints = tuple(inspection.plan.robot.get("joint_names", ()))
+    joints = tuple(inspection.blueprint.robot.get("joint_names", ()))
     found = inspection.statistics
-    return [item for item in inspection.plan.fields if item.names == joints and found[item.name].histogram is not None]
+    return [
+        item for item in inspection.blueprint.fields if item.names == joints and found[item.name].histogram is not None
+    ]
 
 
 def _draw_histograms(figure: "SubFigure", fields: list[Field], statistics: Mapping[str, FieldStatistics]) -> None:
@@ -111,7 +115,7 @@ def _some_rows(inspection: Inspection) -> dict[str, NDArray[Any]]:
     """Read the first rows of the first split that has any."""
     dataset = open_dataset(inspection.folder, allow_partial=True)
     wanted = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
-    fields = [field.name for field in inspection.plan.fields if field.name in wanted]
+    fields = [field.name for field in inspection.blueprint.fields if field.name in wanted]
     split = next(split for split, rows in inspection.rows.items() if rows)
     _, columns = next(dataset.iter_shards(split, fields=fields))
     return {name: values[:SHOWN] for name, values in columns.items()}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, nearest
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, load_plan, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
@@ -28,12 +28,12 @@ class StoredDataset:
 
     Attributes:
         folder: Its folder.
-        plan: Its plan.
+        blueprint: Its plan.
         manifest: Its manifest; None while it is unfinished.
     """
 
     folder: Path
-    plan: DatasetPlan
+    blueprint: Blueprint
     manifest: dict[str, Any] | None
 
     def tasks(self, split: str) -> list[ShardTask]:
@@ -42,11 +42,11 @@ class StoredDataset:
         Raises:
             DatasetError: There is no such split.
         """
-        if split not in self.plan.splits:
-            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(split, self.plan.splits)}")
-        found = [task for task in shards(self.plan) if task.split == split]
+        if split not in self.blueprint.splits:
+            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(split, self.blueprint.splits)}")
+        found = [task for task in shards(self.blueprint) if task.split == split]
         if self.manifest is None:
-            return [task for task in found if is_committed(self.folder, task, self.plan.fingerprint)]
+            return [task for task in found if is_committed(self.folder, task, self.blueprint.fingerprint)]
         return found
 
     def iter_shards(
@@ -87,7 +87,7 @@ class StoredDataset:
         """
         names = self._names(fields)
         tasks = self.tasks(split)
-        rows = self.plan.splits[split]
+        rows = self.blueprint.splits[split]
         stop = rows if stop is None else stop
         if not 0 <= start <= stop <= rows:
             raise DatasetError(f"split {split!r} has rows 0 to {rows}, got {start} to {stop}")
@@ -116,11 +116,15 @@ class StoredDataset:
         }
 
     def _names(self, fields: Sequence[str] | None) -> list[str]:
-        return [self.plan.field_named(name).name for name in fields] if fields else [f.name for f in self.plan.fields]
+        return (
+            [self.blueprint.field_named(name).name for name in fields]
+            if fields
+            else [f.name for f in self.blueprint.fields]
+        )
 
     def _no_rows(self, name: str) -> NDArray[Any]:
-        field = self.plan.field_named(name)
-        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.plan.dtype))
+        field = self.blueprint.field_named(name)
+        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.blueprint.dtype))
 
 
 def _of_sidecar(folder: Path, task: ShardTask) -> tuple[int, str]:
@@ -143,12 +147,12 @@ def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDa
     """
     folder = Path(folder)
     require_folder(folder)
-    plan = load_plan(folder)
+    blueprint = load_blueprint(folder)
     if (folder / MANIFEST).exists():
         manifest = load_manifest(folder)
-        if manifest["plan_fingerprint"] != plan.fingerprint:
+        if manifest["plan_fingerprint"] != blueprint.fingerprint:
             raise DatasetError(f"{folder / MANIFEST} is of another plan than plan.json: the folder mixes two datasets")
-        return StoredDataset(folder, plan, manifest)
+        return StoredDataset(folder, blueprint, manifest)
     if not allow_partial:
-        raise DatasetError(f"{folder} is {unfinished(summarise(folder, plan, allow_partial=True))}")
-    return StoredDataset(folder, plan, None)
+        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_partial=True))}")
+    return StoredDataset(folder, blueprint, None)

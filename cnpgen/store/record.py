@@ -8,11 +8,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, shard_attributes, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, shard_attributes, shards
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import WORK
-from cnpgen.store.outcome import Outcome, outcome_from_json
+from cnpgen.store.outcome import Fates, outcome_from_json
 from cnpgen.store.shard import write_shard
 from cnpgen.store.statistics import FieldStatistics, column_statistics, statistics_from_json
 
@@ -45,7 +45,7 @@ class ShardRecord:
     first_sample_id: int
     plan_fingerprint: str
     statistics: Mapping[str, FieldStatistics]
-    outcome: Outcome
+    outcome: Fates
     started: str = ""
     seconds: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -104,11 +104,11 @@ def load_record(folder: Path, task: ShardTask) -> ShardRecord:
 
 def commit_shard(
     folder: Path,
-    plan: DatasetPlan,
+    blueprint: Blueprint,
     task: ShardTask,
     *,
     columns: Mapping[str, NDArray[Any]],
-    outcome: Outcome,
+    outcome: Fates,
     started: str = "",
     seconds: float = 0.0,
     versions: Mapping[str, str] | None = None,
@@ -117,7 +117,7 @@ def commit_shard(
 
     Args:
         folder: The dataset's folder.
-        plan: Its plan.
+        blueprint: Its plan.
         task: Which shard.
         columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
         outcome: Fates of the draws that were made for it.
@@ -132,36 +132,38 @@ def commit_shard(
         DatasetError: The columns are not what the plan says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    if is_committed(folder, task, plan.fingerprint):  # by somebody to whom the same work was given
+    if is_committed(folder, task, blueprint.fingerprint):  # by somebody to whom the same work was given
         return load_record(folder, task)
     about = {"outcome": outcome, "started": started, "seconds": seconds, "versions": versions or {}}
     try:
-        return _write(folder, plan, task, columns, about)
+        return _write(folder, blueprint, task, columns, about)
     except CnpgenError:
         # somebody may have committed it meanwhile, finished the dataset and swept our temporary file away with theirs
-        if is_committed(folder, task, plan.fingerprint):
+        if is_committed(folder, task, blueprint.fingerprint):
             return load_record(folder, task)
         raise
 
 
 def _write(
     folder: Path,
-    plan: DatasetPlan,
+    blueprint: Blueprint,
     task: ShardTask,
     columns: Mapping[str, NDArray[Any]],
     about: Mapping[str, Any],
 ) -> ShardRecord:
     """Write a shard and then its sidecar, which holds what is said about how the shard came about."""
     path = folder / task.file
-    size = write_shard(path, columns, plan.fields, shard_attributes(plan, task), dtype=plan.dtype, work=folder / WORK)
+    size = write_shard(
+        path, columns, blueprint.fields, shard_attributes(blueprint, task), dtype=blueprint.dtype, work=folder / WORK
+    )
     record = ShardRecord(
         file=task.file,
         bytes=size,
         sha256=file_sha256(path),
         rows=task.rows,
         first_sample_id=task.first_row,
-        plan_fingerprint=plan.fingerprint,
-        statistics=column_statistics(columns, plan.fields),
+        plan_fingerprint=blueprint.fingerprint,
+        statistics=column_statistics(columns, blueprint.fields),
         **about,
     )
     save_record(folder, task, record)
@@ -217,6 +219,6 @@ def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
     return True
 
 
-def pending(folder: Path, plan: DatasetPlan) -> list[ShardTask]:
+def pending(folder: Path, blueprint: Blueprint) -> list[ShardTask]:
     """List the shards that are still to be made, in order."""
-    return [task for task in shards(plan) if not is_committed(folder, task, plan.fingerprint)]
+    return [task for task in shards(blueprint) if not is_committed(folder, task, blueprint.fingerprint)]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.blueprint import DatasetPlan, ShardTask, shards
-from cnpgen.store.outcome import Outcome, densities_to_json, merge_outcomes
+from cnpgen.store.blueprint import Blueprint, ShardTask, shards
+from cnpgen.store.outcome import Fates, densities_to_json, merge_fates
 from cnpgen.store.record import ShardRecord, load_committed
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 
@@ -22,12 +22,12 @@ class Summary:
     """A plan and the records of its shards.
 
     Attributes:
-        plan: The plan.
+        blueprint: The plan.
         records: Every finished shard and its record, in the plan's order.
         problems: Why each of the others is not finished.
     """
 
-    plan: DatasetPlan
+    blueprint: Blueprint
     records: tuple[tuple[ShardTask, ShardRecord], ...]
     problems: tuple[str, ...] = ()
 
@@ -41,28 +41,30 @@ class Summary:
         return [(task, record) for task, record in self.records if task.split == split]
 
     @cached_property
-    def outcomes(self) -> dict[str, Outcome]:
+    def outcomes(self) -> dict[str, Fates]:
         """The fates of the draws, split by split."""
-        return {split: merge_outcomes([item.outcome for _, item in self.of_split(split)]) for split in self.plan.splits}
+        return {
+            split: merge_fates([item.outcome for _, item in self.of_split(split)]) for split in self.blueprint.splits
+        }
 
     @cached_property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> Fates:
         """The fates of all draws."""
-        return merge_outcomes(list(self.outcomes.values()))
+        return merge_fates(list(self.outcomes.values()))
 
     @cached_property
     def statistics(self) -> dict[str, dict[str, FieldStatistics]]:
         """The statistics of every split that has finished shards: split -> field -> statistics."""
-        parts = {split: [item.statistics for _, item in self.of_split(split)] for split in self.plan.splits}
+        parts = {split: [item.statistics for _, item in self.of_split(split)] for split in self.blueprint.splits}
         return {split: merge_statistics(items) for split, items in parts.items() if items}
 
 
-def summarise(folder: Path, plan: DatasetPlan, *, allow_partial: bool = False) -> Summary:
+def summarise(folder: Path, blueprint: Blueprint, *, allow_partial: bool = False) -> Summary:
     """Read the sidecars of a dataset.
 
     Args:
         folder: The dataset's folder.
-        plan: Its plan.
+        blueprint: Its plan.
         allow_partial: Take what is there instead of refusing.
 
     Raises:
@@ -70,12 +72,12 @@ def summarise(folder: Path, plan: DatasetPlan, *, allow_partial: bool = False) -
         MachineError: The system would not let us read something.
     """
     records, problems = [], []
-    for task in shards(plan):
+    for task in shards(blueprint):
         try:
-            records.append((task, load_committed(folder, task, plan.fingerprint)))
+            records.append((task, load_committed(folder, task, blueprint.fingerprint)))
         except DatasetError as error:
             problems.append(str(error))
-    summary = Summary(plan, tuple(records), tuple(problems))
+    summary = Summary(blueprint, tuple(records), tuple(problems))
     if problems and not allow_partial:
         more = [f"and {len(problems) - _N_SHOWN} more"] if len(problems) > _N_SHOWN else []
         shown = "\n  ".join([*problems[:_N_SHOWN], *more])
@@ -100,7 +102,7 @@ def stats_document(summary: Summary) -> dict[str, Any]:
     return {
         "format": STATS_FORMAT,
         "format_version": STATS_FORMAT_VERSION,
-        "plan_fingerprint": summary.plan.fingerprint,
+        "plan_fingerprint": summary.blueprint.fingerprint,
         "splits": {split: _fields_json(fields) for split, fields in summary.statistics.items()},
         "densities": {split: densities_to_json(item.densities) for split, item in summary.outcomes.items()},
     }

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import INFORMATIONAL, DatasetPlan, load_plan, to_json, write_plan
+from cnpgen.store.blueprint import INFORMATIONAL, Blueprint, load_blueprint, to_json, write_plan
 from cnpgen.store.files.atomic import machine_error, read_file, sweep
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 
@@ -57,7 +57,7 @@ def _shard_files(folder: Path) -> Iterator[Path]:
     return (path for path in folder.glob("*/shard-*.*") if _SHARD.fullmatch(path.name))
 
 
-def open_workspace(folder: Path, plan: DatasetPlan) -> None:
+def open_workspace(folder: Path, blueprint: Blueprint) -> None:
     """Create the folder with its plan, or make sure that it holds the same plan already.
 
     A plan of which nothing was made yet gives way to the new one: it costs nothing.
@@ -72,14 +72,14 @@ def open_workspace(folder: Path, plan: DatasetPlan) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise machine_error("create", folder, error) from error
-    if not holds_plan(folder, plan):
+    if not holds_plan(folder, blueprint):
         for name in _SUMMARIES:
             (folder / name).unlink(missing_ok=True)
-        write_plan(folder, plan)
+        write_plan(folder, blueprint)
     sweep(folder / WORK)
 
 
-def holds_plan(folder: Path, plan: DatasetPlan) -> bool:
+def holds_plan(folder: Path, blueprint: Blueprint) -> bool:
     """Whether a folder has the plan already; if not, it may be written.
 
     Raises:
@@ -88,19 +88,19 @@ def holds_plan(folder: Path, plan: DatasetPlan) -> bool:
     """
     used = any(_shard_files(folder))
     try:
-        found = load_plan(folder)
+        found = load_blueprint(folder)
     except DatasetError as error:
         if used:
             raise DatasetError(f"{error}; --force replaces the whole dataset") from error
         return False
-    if found.fingerprint == plan.fingerprint:
+    if found.fingerprint == blueprint.fingerprint:
         return True
     if used:
-        raise UsageError(f"{folder} {_refusal(found, plan)}")
+        raise UsageError(f"{folder} {_refusal(found, blueprint)}")
     return False
 
 
-def _refusal(found: DatasetPlan, wanted: DatasetPlan) -> str:
+def _refusal(found: Blueprint, wanted: Blueprint) -> str:
     """Say why a dataset cannot become another one, and what to do."""
     differences = _differences(to_json(found), to_json(wanted))
     if not differences:
@@ -125,19 +125,19 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _sizes(plan: DatasetPlan) -> str:
-    splits = ", ".join(f"{split} {rows:,}" for split, rows in plan.splits.items())
-    return f"{sum(plan.splits.values()):,} rows ({splits})"
+def _sizes(blueprint: Blueprint) -> str:
+    splits = ", ".join(f"{split} {rows:,}" for split, rows in blueprint.splits.items())
+    return f"{sum(blueprint.splits.values()):,} rows ({splits})"
 
 
-def require_plan(folder: Path, plan: DatasetPlan) -> None:
+def require_plan(folder: Path, blueprint: Blueprint) -> None:
     """Make sure that the folder still belongs to a plan: another process may have replaced the dataset meanwhile.
 
     Raises:
         UsageError: It has another plan now, or none.
     """
     try:
-        mine = plan.fingerprint.encode() in read_file(folder / PLAN)
+        mine = blueprint.fingerprint.encode() in read_file(folder / PLAN)
     except DatasetError:
         mine = False
     if not mine:
@@ -187,7 +187,7 @@ def check_clearable(folder: Path) -> list[Path]:
 def _splits(folder: Path) -> list[Path]:
     """List the folders of the splits: those that the plan names, or, where it is damaged, those with shards."""
     try:
-        splits = [folder / split for split in load_plan(folder).splits]
+        splits = [folder / split for split in load_blueprint(folder).splits]
     except DatasetError:
         splits = sorted({path.parent for path in _shard_files(folder)})
     return [split for split in splits if split.is_dir()]

@@ -9,7 +9,7 @@ from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import BOUNDARY
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.training.rows import boundary_columns
 from cnpgen.trajectory.boundary import Boundary
 
@@ -17,7 +17,7 @@ DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a c
 
 
 @dataclass(frozen=True)
-class Source:
+class TrainingData:
     """A dataset that is trained on.
 
     Attributes:
@@ -64,18 +64,18 @@ class Source:
 
     def describe(self) -> dict[str, Any]:
         """Say which rows these are, for the model's file."""
-        plan = self.dataset.plan
+        blueprint = self.dataset.blueprint
         return {
-            "name": plan.name,
-            "version": plan.version,
-            "seed": plan.seed,
-            "recipe_sha256": plan.recipe_sha256,
+            "name": blueprint.name,
+            "version": blueprint.version,
+            "seed": blueprint.seed,
+            "recipe_sha256": blueprint.recipe_sha256,
             "fingerprint": self.dataset.fingerprint,
             "rows": dict(self.dataset.splits),
         }
 
 
-def open_source(folder: str | Path) -> Source:
+def open_training_data(folder: str | Path) -> TrainingData:
     """Open a dataset for training.
 
     Raises:
@@ -90,9 +90,9 @@ def open_source(folder: str | Path) -> Source:
     validation = "validation" if "validation" in others else others[0]
     if dataset.splits[validation] < 2:
         raise DatasetError(f"{folder} has 1 row in {validation!r}: models are compared by some and judged on others")
-    return Source(dataset, train, validation)
+    return TrainingData(dataset, train, validation)
 
 
-def stages_of(plan: DatasetPlan) -> list[dict[str, Any]]:
+def stages_of(blueprint: Blueprint) -> list[dict[str, Any]]:
     """Return how the rows of a dataset were drawn."""
-    return list(plan.recipe["pipeline"]["stage"])
+    return list(blueprint.recipe["pipeline"]["stage"])

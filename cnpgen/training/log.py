@@ -10,7 +10,7 @@ from cnpgen.store.files.atomic import machine_error, write_file
 OURS = {"step", "epoch", "learning_rate", "seconds", "lost"}  # keys of the first line of every log
 
 
-class Journal:
+class TrainingLog:
     """Appends to a log.
 
     Args:

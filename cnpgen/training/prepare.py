@@ -17,7 +17,7 @@ from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
-from cnpgen.training.data import Source, stages_of
+from cnpgen.training.data import TrainingData, stages_of
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.run import Run
 from cnpgen.training.score import validate
@@ -30,7 +30,7 @@ WARMING, TIMED = 10, 50  # steps taken to find out how long one takes
 
 
 def prepare_run(
-    source: Source, given: Surroundings, settings: TrainingSettings, *, check_rows: int = 200, command: str = ""
+    source: TrainingData, given: Surroundings, settings: TrainingSettings, *, check_rows: int = 200, command: str = ""
 ) -> tuple[Run, Kit]:
     """Load rows, kernels and loss; set up the network.
 
@@ -66,7 +66,7 @@ def prepare_run(
         problem=given.record,
         validate=lambda model: validate(model, kit, held_out),
         rest=rest,
-        training={"command": command, **identity(source, settings), "stages": stages_of(source.dataset.plan)},
+        training={"command": command, **identity(source, settings), "stages": stages_of(source.dataset.blueprint)},
     )
     return run, kit
 
@@ -76,12 +76,12 @@ def _kit(given: Surroundings, settings: TrainingSettings, *, slow_down: bool) ->
     return make_kit(given, bending_steps=bending, landing_steps=landing, slow_down=slow_down)
 
 
-def identity(source: Source, settings: TrainingSettings) -> dict[str, Any]:
+def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
     """Say what, beside its length, distinguishes one run from another; JSON-able."""
     return {"cnpgen": __version__, "dataset": source.describe(), "settings": plain(asdict(settings))}
 
 
-def _with_demonstrations(rows: Rows, source: Source, given: Surroundings) -> Rows:
+def _with_demonstrations(rows: Rows, source: TrainingData, given: Surroundings) -> Rows:
     shown = source.demonstrations(given.robot.n)
     if shown is None:
         raise UsageError(

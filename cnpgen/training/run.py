@@ -17,7 +17,7 @@ from cnpgen.planner.network.features import Features
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.training.adam import learning_rate
 from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.training.log import Journal
+from cnpgen.training.log import TrainingLog
 from cnpgen.training.rows import Rows, StepRows
 from cnpgen.training.state import Best, State, Sums
 from cnpgen.training.step import Learner
@@ -63,7 +63,7 @@ class Run:
         settings = self.learner.settings
         self.order = StepRows(len(self.rows), settings.batch_size, settings.seed)
 
-    def go_on(self, state: State, checkpoints: Checkpoints, journal: Journal, watch: Watcher | None = None) -> None:
+    def go_on(self, state: State, checkpoints: Checkpoints, journal: TrainingLog, watch: Watcher | None = None) -> None:
         """Train until the end.
 
         Args:
@@ -86,7 +86,7 @@ class Run:
                 if waiting.number is not None:
                     checkpoints.save(state)
 
-    def _go_on(self, state: State, gradient: Array, journal: Journal, watch: Watcher | None) -> None:
+    def _go_on(self, state: State, gradient: Array, journal: TrainingLog, watch: Watcher | None) -> None:
         """Take a step, with all that is due after it."""
         begun = time.process_time()
         self.step(state, gradient)

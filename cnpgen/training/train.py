@@ -10,13 +10,13 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
-from cnpgen.planner.requests import problem_of
+from cnpgen.planner.requests import record_of
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.documents import plain
 from cnpgen.training.checkpoint import Checkpoints, differences
-from cnpgen.training.data import Source, open_source
+from cnpgen.training.data import TrainingData, open_training_data
 from cnpgen.training.files import CHECKPOINT, LOG, check_beside, check_out, sweep_beside
-from cnpgen.training.log import Journal
+from cnpgen.training.log import TrainingLog
 from cnpgen.training.prepare import begin_run, identity, prepare_run
 from cnpgen.training.run import Run, Watcher
 from cnpgen.training.score import validate
@@ -92,12 +92,12 @@ def train_model(
         if job.out.exists() and not job.checkpoints.path.exists():
             return _finished(job)
         check_beside(job.out)
-    with one_thread(), surroundings(problem_of(job.source.dataset.plan)) as given:
+    with one_thread(), surroundings(record_of(job.source.dataset.blueprint)) as given:
         run, kit = prepare_run(job.source, given, job.settings, check_rows=job.check_rows, command=command)
         state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
         if begin is not None:
             begin(state, run)
-        journal = Journal(job.out.with_suffix(LOG), state.log)
+        journal = TrainingLog(job.out.with_suffix(LOG), state.log)
         run.go_on(state, job.checkpoints, journal, watch)
         job.checkpoints.save(state)
         return _kept(job, run, state, kit=kit, journal=journal, workers=workers)
@@ -107,7 +107,7 @@ def train_model(
 class _Job:
     """What is to be trained, on what, for how long, and where it goes."""
 
-    source: Source
+    source: TrainingData
     out: Path
     settings: TrainingSettings
     length: Length
@@ -121,12 +121,12 @@ def _job(folder: str | Path, out: Path, settings: TrainingSettings, lasts: Mappi
     length, check_rows = Length(**given), integer("check_rows", check_rows, least=1)
     check_out(out)
     sweep_beside(out)
-    source = open_source(folder)
+    source = open_training_data(folder)
     asked = {**identity(source, settings), "length": plain(given), "check_rows": check_rows}
     return _Job(source, out, settings, length, check_rows, Checkpoints(out.with_suffix(CHECKPOINT), asked))
 
 
-def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: Journal, workers: int | None) -> Trained:
+def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: TrainingLog, workers: int | None) -> Trained:
     """Judge the best model and write it; the log's last line is not in the checkpoint, so that it comes but once."""
     best = run.model(state.best.parameters)
     score = validate(best, kit, job.source.judged(MOST_JUDGED, after=job.check_rows), workers=workers)

@@ -12,7 +12,7 @@ from cnpgen.machine.versions import versions
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.make.shards import blocks_of, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.blueprint import REVISION, DatasetPlan, ShardTask
+from cnpgen.store.blueprint import REVISION, Blueprint, ShardTask
 from cnpgen.store.check import Finding
 from cnpgen.store.reader import StoredDataset
 from cnpgen.validate.documents import restored
@@ -38,12 +38,12 @@ class Regeneration:
     findings: tuple[Finding, ...] = ()
 
 
-def make_again(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: int) -> Regeneration:
+def make_again(folder: Path, blueprint: Blueprint, tasks: list[ShardTask], count: int) -> Regeneration:
     """Make random blocks again.
 
     Args:
         folder: The dataset.
-        plan: Its plan.
+        blueprint: Its plan.
         tasks: The shards whose blocks may be chosen.
         count: How many blocks to choose; all of them if there are fewer.
 
@@ -51,40 +51,42 @@ def make_again(folder: Path, plan: DatasetPlan, tasks: list[ShardTask], count: i
         MachineError: The backend that made the dataset does not work here.
         UsageError: The blocks of this version have another size.
     """
-    size = plan.block_rows
+    size = blueprint.block_rows
     pieces = [(task, block) for task in tasks for block in blocks_of(task, size)]
-    backend, cache_folder = backend_of(folder, plan)
-    dataset = StoredDataset(folder, plan, None)  # whatever became of the manifest
+    backend, cache_folder = backend_of(folder, blueprint)
+    dataset = StoredDataset(folder, blueprint, None)  # whatever became of the manifest
     chosen = np.random.default_rng().permutation(len(pieces))[:count]
     identical, findings = 0, []
-    with restored(plan) as recipe:
-        prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=plan.dtype)
+    with restored(blueprint) as recipe:
+        prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=blueprint.dtype)
         if prepared.block_rows != size:
             raise UsageError(f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}")
         for task, block in (pieces[index] for index in chosen):
             start = max(block * size, task.first_row)
             stop = min((block + 1) * size, task.first_row + task.rows)
-            again, _ = next(shard_columns(prepared, plan, [ShardTask(task.split, task.index, start, stop - start)]))
+            again, _ = next(
+                shard_columns(prepared, blueprint, [ShardTask(task.split, task.index, start, stop - start)])
+            )
             same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
             identical += same
             if problem:
-                text = f"block {block} made again from the seed: {problem}{_explanation(plan, recipe)}"
+                text = f"block {block} made again from the seed: {problem}{_explanation(blueprint, recipe)}"
                 findings.append(Finding(task.file, text))
     return Regeneration(len(chosen), len(pieces), identical, tuple(findings))
 
 
-def backend_of(folder: Path, plan: DatasetPlan) -> tuple[Backend, Path]:
+def backend_of(folder: Path, blueprint: Blueprint) -> tuple[Backend, Path]:
     """Return the backend that made a dataset, and its cache folder.
 
     Raises:
         MachineError: It does not work here.
     """
     try:
-        return choose_backend(plan.backend)
+        return choose_backend(blueprint.backend)
     except MachineError as error:
         raise MachineError(
-            f"{folder} was made by the {plan.backend} backend, which does not work here ({error}): its blocks cannot"
-            " be made again; 'cnpgen validate' and 'cnpgen validate --deep' work without it"
+            f"{folder} was made by the {blueprint.backend} backend, which does not work here ({error}): its blocks"
+            " cannot be made again; 'cnpgen validate' and 'cnpgen validate --deep' work without it"
         ) from error
 
 
@@ -99,12 +101,12 @@ def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
     return same, ""
 
 
-def _explanation(plan: DatasetPlan, recipe: DatasetRecipe) -> str:
+def _explanation(blueprint: Blueprint, recipe: DatasetRecipe) -> str:
     """Name the libraries and plug-ins that are not those that made the dataset."""
     now = versions()
-    other = [f"{name} {was} -> {now.get(name)}" for name, was in plan.versions.items() if now.get(name) != was]
-    if plan.revision != REVISION:
-        other.append(f"revision of the generator {plan.revision} -> {REVISION}")
-    if recipe_digest(recipe) != plan.recipe_sha256:  # the plan's own recipe, so that only code can be different
+    other = [f"{name} {was} -> {now.get(name)}" for name, was in blueprint.versions.items() if now.get(name) != was]
+    if blueprint.revision != REVISION:
+        other.append(f"revision of the generator {blueprint.revision} -> {REVISION}")
+    if recipe_digest(recipe) != blueprint.recipe_sha256:  # the plan's own recipe, so that only code can be different
         other.append("the code of its plug-ins has changed")
     return f" (made with other versions: {', '.join(other)})" if other else ""

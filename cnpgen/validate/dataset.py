@@ -9,7 +9,7 @@ from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.report import RowReport
 from cnpgen.machine.workers import worker_count
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import DatasetPlan, load_plan, shards
+from cnpgen.store.blueprint import Blueprint, load_blueprint, shards
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.layout import PLAN
 from cnpgen.store.paths import require_folder
@@ -82,7 +82,9 @@ class ValidationReport:
                 for check in self.deep.checks
             ]
         if self.plans:
-            lines.append(f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
+            lines.append(
+                f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'blueprint')}, {self.plans[1]:,} valid"
+            )
         if self.wanted:
             lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
         advice = dict.fromkeys(finding.advice for finding in self.findings if finding.advice and not finding.note)
@@ -128,16 +130,16 @@ def validate_dataset(
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
     findings = check_dataset(folder)
     try:
-        plan = load_plan(folder)
+        blueprint = load_blueprint(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    _require_means(folder, plan, deep=deep, regenerate=regenerate)
-    present = [task for task in shards(plan) if is_committed(folder, task, plan.fingerprint)]
+    _require_means(folder, blueprint, deep=deep, regenerate=regenerate)
+    present = [task for task in shards(blueprint) if is_committed(folder, task, blueprint.fingerprint)]
     wrong = {finding.file for finding in findings if not finding.note}
     whole = [task for task in present if task.file not in wrong]
-    findings += check_recipe(plan) + (check_statistics(folder, plan) if deep else [])
-    checked = check_rows(folder, plan, whole, worker_count(workers, len(whole)), progress) if deep else DeepCheck()
-    again = make_again(folder, plan, whole, regenerate) if regenerate else Regeneration()
+    findings += check_recipe(blueprint) + (check_statistics(folder, blueprint) if deep else [])
+    checked = check_rows(folder, blueprint, whole, worker_count(workers, len(whole)), progress) if deep else DeepCheck()
+    again = make_again(folder, blueprint, whole, regenerate) if regenerate else Regeneration()
     return ValidationReport(
         folder,
         sum(task.rows for task in present),
@@ -151,10 +153,10 @@ def validate_dataset(
     )
 
 
-def _require_means(folder: Path, plan: DatasetPlan, *, deep: bool, regenerate: int) -> None:
+def _require_means(folder: Path, blueprint: Blueprint, *, deep: bool, regenerate: int) -> None:
     """Say what is missing on this machine before anything takes long."""
     if regenerate:
-        backend_of(folder, plan)
+        backend_of(folder, blueprint)
     if deep or regenerate:
-        with restored(plan):
+        with restored(blueprint):
             pass

@@ -8,29 +8,31 @@ from pathlib import Path
 from cnpgen.errors import DatasetError
 from cnpgen.make.load import restore_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe, resolved_digest
-from cnpgen.store.blueprint import DatasetPlan
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.files.documents import load_document, plain
 from cnpgen.store.layout import PLAN, STATS
 from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
 
 
-def check_recipe(plan: DatasetPlan) -> list[Finding]:
+def check_recipe(blueprint: Blueprint) -> list[Finding]:
     """Check that the digest of the recipe in a plan is that of the recipe in it."""
     try:
-        found = resolved_digest(plan.recipe["pipeline"], str(plan.robot["urdf"]).encode())
+        found = resolved_digest(blueprint.recipe["pipeline"], str(blueprint.robot["urdf"]).encode())
     except (KeyError, TypeError, AttributeError):
         return [Finding(PLAN, "has no recipe that can be read", advice=REPLACE)]
-    if found == plan.recipe_sha256:
+    if found == blueprint.recipe_sha256:
         return []
-    return [Finding(PLAN, f"its recipe has the sha256 {found}, not the recorded {plan.recipe_sha256}", advice=REPLACE)]
+    return [
+        Finding(PLAN, f"its recipe has the sha256 {found}, not the recorded {blueprint.recipe_sha256}", advice=REPLACE)
+    ]
 
 
-def check_statistics(folder: Path, plan: DatasetPlan) -> list[Finding]:
+def check_statistics(folder: Path, blueprint: Blueprint) -> list[Finding]:
     """Check that ``stats.json`` sums up the records of the shards, all of which must be there."""
     try:
         document = load_document(folder / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION)
-        expected = plain(stats_document(summarise(folder, plan)))
+        expected = plain(stats_document(summarise(folder, blueprint)))
     except DatasetError:  # missing or damaged: found already
         return []
     wrong = [key for key in expected if document.get(key) != expected[key]]
@@ -41,7 +43,7 @@ def check_statistics(folder: Path, plan: DatasetPlan) -> list[Finding]:
 
 
 @contextmanager
-def restored(plan: DatasetPlan) -> Iterator[DatasetRecipe]:
+def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
     """Rebuild the recipe from a plan, its URDF in a temporary folder that is gone when the block ends.
 
     Raises:
@@ -49,4 +51,4 @@ def restored(plan: DatasetPlan) -> Iterator[DatasetRecipe]:
         PluginError: It needs packages that are not installed.
     """
     with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-        yield restore_dataset_recipe(dict(plan.recipe), str(plan.robot["urdf"]), Path(folder))
+        yield restore_dataset_recipe(dict(blueprint.recipe), str(blueprint.robot["urdf"]), Path(folder))

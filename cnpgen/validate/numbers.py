@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import EXACTNESS
-from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.record import ShardRecord
 from cnpgen.store.statistics import FieldStatistics, field_statistics
@@ -17,11 +17,11 @@ Columns = Mapping[str, NDArray[Any]]
 SUMMATION = 1e-9  # relative: what sums of the same numbers may differ by from one NumPy to another
 
 
-def check_numbers(plan: DatasetPlan, task: ShardTask, columns: Columns, record: ShardRecord) -> list[str]:
+def check_numbers(blueprint: Blueprint, task: ShardTask, columns: Columns, record: ShardRecord) -> list[str]:
     """Check the rows of a shard against its plan and its record.
 
     Args:
-        plan: The dataset's plan.
+        blueprint: The dataset's plan.
         task: The shard.
         columns: All its fields, shape (rows, width) or (rows,).
         record: What is recorded of it.
@@ -29,8 +29,10 @@ def check_numbers(plan: DatasetPlan, task: ShardTask, columns: Columns, record: 
     Returns:
         What is wrong.
     """
-    problems = [text for field in plan.fields for text in _check_range(field, columns[field.name], task, plan.dtype)]
-    problems += [text for field in plan.fields for text in _check_statistics(field, columns[field.name], record)]
+    problems = [
+        text for field in blueprint.fields for text in _check_range(field, columns[field.name], task, blueprint.dtype)
+    ]
+    problems += [text for field in blueprint.fields for text in _check_statistics(field, columns[field.name], record)]
     if {"hit_speed", "hit_speed_max"} <= columns.keys():
         faster = np.flatnonzero(~(columns["hit_speed"] <= columns["hit_speed_max"]))
         if len(faster):

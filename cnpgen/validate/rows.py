@@ -16,7 +16,7 @@ from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.machine.workers import share_out
 from cnpgen.make.certify import PlanCheck, check_plans
 from cnpgen.problems.robot import load_robot
-from cnpgen.store.blueprint import DatasetPlan, ShardTask
+from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.check import DELETE, Finding
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
@@ -44,19 +44,19 @@ class DeepCheck:
 
 
 def check_rows(
-    folder: Path, plan: DatasetPlan, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
+    folder: Path, blueprint: Blueprint, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
 ) -> DeepCheck:
     """Recompute every row, shard by shard, and judge every plan.
 
     Args:
         folder: The dataset.
-        plan: Its plan.
+        blueprint: Its plan.
         tasks: The shards to read.
         workers: Processes.
         progress: Called with the rows of every shard that was read.
     """
     checks, findings = [], []
-    with closing(share_out(partial(_verify_shard, folder, plan), tasks, workers, ordered=True)) as results:
+    with closing(share_out(partial(_verify_shard, folder, blueprint), tasks, workers, ordered=True)) as results:
         for task, result in zip(tasks, results, strict=True):
             findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
             checks.append(result)
@@ -88,19 +88,19 @@ class _ShardCheck:
     plans: PlanCheck
 
 
-def _verify_shard(folder: Path, plan: DatasetPlan, task: ShardTask) -> _ShardCheck:
+def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _ShardCheck:
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
         columns = read_shard(folder / task.file)
         record = load_record(folder, task)
     except CnpgenError as error:
         return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck())
-    with restored(plan) as recipe:
+    with restored(blueprint) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
-        report = verify_rows(problem, robot, columns, dtype=plan.dtype)
+        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype)
         plans = check_plans(problem, robot, columns)
-    problems = [*plans.problems, *check_numbers(plan, task, columns, record)]
+    problems = [*plans.problems, *check_numbers(blueprint, task, columns, record)]
     problems += [
         f"{check.name}: {counted(check.rows_out, 'row')} out, worst {check.worst:.3g} {check.unit}"
         f" (allowed {check.allowed:.3g}) in row {task.first_row + check.worst_row}"

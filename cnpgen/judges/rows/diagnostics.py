@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cnpgen.judges.rows.report import ENDS, Array, Check, Index, judge
+from cnpgen.judges.rows.report import ENDS, Array, Check, Index, compare
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.world.state import World
 
@@ -46,7 +46,9 @@ class Diagnostic:
         some, end = np.nonzero(~np.isnan(self.stored[finite]))
         row = finite[some]
         error = np.abs(self.stored[row, end] - self.found[row, end])
-        return judge(self.name, self.unit, violation=error, allowed=np.full(len(row), ALLOWED[dtype]), row=row, end=end)
+        return compare(
+            self.name, self.unit, violation=error, allowed=np.full(len(row), ALLOWED[dtype]), row=row, end=end
+        )
 
 
 def stored_diagnostics(problem: "Problem", columns: Mapping[str, Array]) -> list[Diagnostic]:

@@ -80,7 +80,7 @@ class RowReport:
         return {"rows": self.rows, "out": self.out.tolist(), "checks": [check.to_dict() for check in self.checks]}
 
 
-def judge(name: str, unit: str, *, violation: Array, allowed: Array, row: Index, end: Index) -> tuple[Check, Index]:
+def compare(name: str, unit: str, *, violation: Array, allowed: Array, row: Index, end: Index) -> tuple[Check, Index]:
     """Compare measured violations with what is allowed.
 
     Args:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cnpgen.errors import DatasetError
 from cnpgen.judges.rows.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
 from cnpgen.judges.rows.fastest_hit import highest_speed
-from cnpgen.judges.rows.report import ENDS, Array, Check, Index, RowReport, judge, merge
+from cnpgen.judges.rows.report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.world.state import World
@@ -100,7 +100,7 @@ class _Values:
         g = np.array(values, float)
         violation = np.maximum(np.maximum(lower - g, g - upper), 0.0)
         allowed = Condition(name, unit, values, lower, upper, exactness).slack(dtype)
-        return judge(name, unit, violation=violation, allowed=allowed, row=row, end=end)
+        return compare(name, unit, violation=violation, allowed=allowed, row=row, end=end)
 
 
 @dataclass
@@ -129,7 +129,7 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
     block = _measure(problem, world, columns, finite)
     zeros = np.zeros(rows, np.int64)
     judged = [
-        judge(
+        compare(
             "finite", "1", violation=n_bad.astype(float), allowed=zeros.astype(float), row=np.arange(rows), end=zeros
         ),
         _judge_position(block, columns, finite, dtype),
@@ -187,7 +187,7 @@ def _judge_position(block: _Block, columns: dict[str, Array], finite: Index, dty
     error = np.linalg.norm(block.position - claimed, axis=2)[finite].ravel()
     row, end = np.repeat(finite, len(ENDS)), np.tile(np.arange(len(ENDS)), len(finite))
     allowed = np.full(error.shape, EXACTNESS[dtype]["position"])
-    return judge("tip position", "m", violation=error, allowed=allowed, row=row, end=end)
+    return compare("tip position", "m", violation=error, allowed=allowed, row=row, end=end)
 
 
 def _judge_hit(block: _Block, columns: dict[str, Array], finite: Index, dtype: str) -> Iterator[tuple[Check, Index]]:
@@ -201,7 +201,7 @@ def _judge_hit(block: _Block, columns: dict[str, Array], finite: Index, dtype: s
 
     def judged(name: str, unit: str, error: Any, rows: Index, exactness: str) -> tuple[Check, Index]:
         allowed = np.full(len(rows), EXACTNESS[dtype][exactness])
-        return judge(name, unit, violation=np.abs(error), allowed=allowed, row=rows, end=np.ones(len(rows), np.int64))
+        return compare(name, unit, violation=np.abs(error), allowed=allowed, row=rows, end=np.ones(len(rows), np.int64))
 
     direction = np.arctan2(across, along)[moving]
     yield judged("hit direction", "rad", direction, finite[moving], "direction")
@@ -216,4 +216,4 @@ def _judge_highest(
         highest = highest_speed(block.hit_jacobian[finite], columns["hit_angle"][finite, 0], robot.velocity_limit)
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
         allowed, end = np.full(len(finite), ALLOWED[dtype]), np.ones(len(finite), np.int64)
-        yield judge("highest hit speed", "m/s", violation=error, allowed=allowed, row=finite, end=end)
+        yield compare("highest hit speed", "m/s", violation=error, allowed=allowed, row=finite, end=end)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -51,13 +51,13 @@ class BrakingReach(Stage):
         del context
         return ()
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernels."""
         table = context.constraint(Table)
         tip = context.kernels.load(tip_state)
         brake = context.kernels.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             for end, sign in (("start", 1.0), ("goal", -1.0)):
                 q, dq = batch[f"{end}_q"], sign * batch[f"{end}_dq"]
                 excess = overshoot(tip, brake, table, q, dq, margin=self.margin)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
@@ -54,7 +54,7 @@ class Collision(Stage):
         text = "distance of the arm's skeleton from the nearest obstacle at the {}, less the capsules' radius"
         return tuple(Field(f"{end}_clearance", "m", text.format(end), role="diagnostic") for end in self._ends())
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel or build the geometry."""
         radius = context.constraint(RobotClearance).radius
         return self._by_coal(context, radius) if self.judge == "coal" else self._by_segments(context, radius)
@@ -62,10 +62,10 @@ class Collision(Stage):
     def _ends(self) -> tuple[str, ...]:
         return ("start", "goal") if self.end == "both" else (self.end,)
 
-    def _by_segments(self, context: Context, radius: float) -> Run:
+    def _by_segments(self, context: Context, radius: float) -> Work:
         kernel = context.kernels.load(skeleton_distance)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             for end in self._ends():
                 (distance,) = kernel(batch[f"{end}_q"], sample_tops(context.problem, batch))
                 batch[f"{end}_clearance"] = distance - radius
@@ -73,11 +73,11 @@ class Collision(Stage):
 
         return run
 
-    def _by_coal(self, context: Context, radius: float) -> Run:
+    def _by_coal(self, context: Context, radius: float) -> Work:
         depth = context.constraint(ObjectContact).depth
         judge = coal_judge(context.problem, context.robot, radius, depth)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             tops = sample_tops(context.problem, batch)
             hit = judge(
                 np.concatenate([batch[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends()))
@@ -87,7 +87,7 @@ class Collision(Stage):
         return run
 
 
-def sample_tops(problem: Problem, batch: Batch) -> Array:
+def sample_tops(problem: Problem, batch: Round) -> Array:
     """Heights of the obstacles' upper faces for every draw [m], shape (obstacles, n)."""
     return np.ascontiguousarray(obstacle_tops(problem, batch["start_xyz"].T, batch["goal_xyz"].T).T)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 
@@ -42,11 +42,11 @@ class DrawPositions(Stage):
             for end, box in (("start", self.start), ("goal", self.goal))
         )
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Check that the boxes can be reached and return the draw."""
         self._check_reach(context)
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             batch["start_xyz"] = uniform(batch.draw(random, 3), self.start)
             batch["goal_xyz"] = uniform(batch.draw(random, 3), self.goal)
             apart = np.hypot(*(batch["goal_xyz"] - batch["start_xyz"])[:2])

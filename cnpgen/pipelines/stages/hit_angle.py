@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -39,11 +39,11 @@ class HitAngleToGoal(Stage):
         del context
         return (_angle_field(),)
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Nothing to load."""
         del context
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             x, y = batch["goal_xyz"][:2]
             noise = self.noise * (2 * batch.draw(random, 1) - 1)
             batch["hit_angle"] = wrap(np.arctan2(self.target[1] - y, self.target[0] - x) + noise)
@@ -70,11 +70,11 @@ class HitAngleInCone(Stage):
         del context
         return (_angle_field(),)
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Nothing to load."""
         del context
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             x, y = (batch["goal_xyz"] - batch["start_xyz"])[:2]
             noise = self.half_angle * (2 * batch.draw(random, 1) - 1)
             batch["hit_angle"] = wrap(np.arctan2(y, x) + noise)

@@ -16,7 +16,7 @@ from cnpgen.pipelines.stages.hitting_newton import MAX_STEPS, TOLERANCE, basic_j
 from cnpgen.pipelines.stages.ik import MAX_STEPS as IK_STEPS
 from cnpgen.pipelines.stages.ik import TOLERANCE as IK_TOLERANCE
 from cnpgen.pipelines.stages.ik import ik_step
-from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -40,14 +40,14 @@ class HittingConfiguration(Stage):
         """The goal configuration."""
         return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernels."""
         robot = context.robot
         if robot.n < 3 or any(joint.prismatic for joint in robot.chain.joints):
             raise RecipeError(["needs three or more planned joints, all of them revolute"])
         search = _Search(context)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             n = len(batch.alive)
             home = batch["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], n, axis=1)
             direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])

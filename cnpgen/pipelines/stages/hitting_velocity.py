@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, dot
@@ -61,11 +61,11 @@ class HittingVelocity(Stage):
             ),
         )
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel."""
         kernel = context.kernels.load(hitting_velocity)
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
             velocity, speed = kernel(batch["goal_q"], direction)
             factor, choice = batch.draw(random, 1), batch.draw(random, 1)

@@ -9,7 +9,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import uniform
-from cnpgen.pipelines.stages.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, add, dot, gram, scale, solve, subtract
@@ -35,13 +35,13 @@ class _IK(Stage):
     orientation: str = field("what the tip's orientation must be", choices=("free", "vertical"), default="free")
     max_step: float = field("largest change of a joint in one iteration", unit="rad", default=0.4, low=1e-3)
 
-    def _solve(self, context: Context, end: str, initial: str) -> Run:
+    def _solve(self, context: Context, end: str, initial: str) -> Work:
         kernel = context.kernels.load(
             ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=self.orientation == "vertical", max_step=self.max_step
         )
         low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             q, error = kernel(batch[initial], batch[f"{end}_xyz"])
             batch[f"{end}_q"] = q
             batch.reject(error[0] < TOLERANCE, f"no inverse kinematics of the {end}")
@@ -70,7 +70,7 @@ class StartIK(_IK):
         """The start configuration."""
         return (context.joint_field("start_q", "rad", "joint positions at the start"),)
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel."""
         n = context.robot.n
         if self.guess and len(self.guess) != n:
@@ -78,7 +78,7 @@ class StartIK(_IK):
         guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
         solve_start = self._solve(context, "start", "guess_q")
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             batch["guess_q"] = uniform(batch.draw(random, n), guess)
             solve_start(batch, random)
 
@@ -99,7 +99,7 @@ class GoalIK(_IK):
         """The goal configuration."""
         return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel."""
         return self._solve(context, "goal", "start_q")
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -45,11 +45,11 @@ class AtRest(Stage):
         del context
         return f"{self.end}_dq", f"{self.end}_ddq"
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Nothing to load."""
         n = context.robot.n
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             for name in (f"{self.end}_dq", f"{self.end}_ddq"):
                 batch[name] = np.zeros((n, len(batch.alive)))
 
@@ -79,12 +79,12 @@ class TableVelocity(Stage):
         del context
         return "start_dq", "start_tip_velocity"
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel."""
         context.constraint(Table)
         kernel, n = context.kernels.load(table_velocity), context.robot.n
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             direction, length, choice = 2 * batch.draw(random, n) - 1, batch.draw(random, 1), batch.draw(random, 1)
             length[choice < self.at_rest] = 0.0
             batch["start_dq"], batch["start_tip_velocity"] = kernel(batch["start_q"], direction, length)
@@ -115,12 +115,12 @@ class TableAcceleration(Stage):
         """The acceleration."""
         return _motion_fields(context, self.end)[1:]
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel."""
         context.constraint(Table)
         kernel, n = context.kernels.load(table_acceleration), context.robot.n
 
-        def run(batch: Batch, random: np.random.Generator) -> None:
+        def run(batch: Round, random: np.random.Generator) -> None:
             direction, length = 2 * batch.draw(random, n) - 1, batch.draw(random, 1)
             acceleration, room = kernel(batch[f"{self.end}_q"], batch[f"{self.end}_dq"], direction, length)
             batch[f"{self.end}_ddq"] = acceleration

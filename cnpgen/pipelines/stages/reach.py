@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -39,11 +39,11 @@ class BallisticReach(Stage):
         del context
         return ()
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Look up the table."""
         table = context.constraint(Table)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             if self.start_time:
                 ahead = batch["start_xyz"] + self.start_time * batch["start_tip_velocity"]
                 batch.reject(over(table, ahead), "the start leaves the table")
@@ -62,7 +62,7 @@ def over(table: Table, position: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def hit_velocity(batch: Batch) -> Array:
+def hit_velocity(batch: Round) -> Array:
     """Horizontal velocity of the tip at the goal [m/s], shape (2, n)."""
     angle, speed = batch["hit_angle"], batch["hit_speed"]
     return np.concatenate([speed * np.cos(angle), speed * np.sin(angle)])

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 BLOCK_ROWS = 4096  # rows per block, unless a stage wants fewer
 
 
-class Batch:
+class Round:
     """A round of draws and the columns that are known of those still alive.
 
     Attributes:
@@ -70,7 +70,7 @@ class Batch:
         self.columns = {name: np.take(values, keep, axis=1) for name, values in self.columns.items()}
 
 
-Run = Callable[[Batch, np.random.Generator], None]
+Work = Callable[[Round, np.random.Generator], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,7 @@ class Stage(ABC):
         return tuple(field.name for field in self.provides(context))
 
     @abstractmethod
-    def prepare(self, context: "Context") -> Run:
+    def prepare(self, context: "Context") -> Work:
         """Load what the stage needs (kernels, geometry) and return the function that works on a batch.
 
         Args:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Batch, Run, Stage
+from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.state import inverse_dynamics, symbols
@@ -38,11 +38,11 @@ class GravityTorque(Stage):
         text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
         return (Field(f"{self.end}_torque_ratio", "1", text, role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),)
 
-    def prepare(self, context: Context) -> Run:
+    def prepare(self, context: Context) -> Work:
         """Load the kernel."""
         kernel = context.kernels.load(torque_ratio)
 
-        def run(batch: Batch, _random: np.random.Generator) -> None:
+        def run(batch: Round, _random: np.random.Generator) -> None:
             (ratio,) = kernel(batch[f"{self.end}_q"])
             batch[f"{self.end}_torque_ratio"] = ratio
             batch.reject(ratio[0] <= 1.0, f"joint torque limit at the {self.end}")

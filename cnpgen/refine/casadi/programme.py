@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cnpgen.refine.casadi.callbacks import Callbacks
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.hessian import lagrangian_hessian
-from cnpgen.refine.solver.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.transcription import Linearisation, Transcription
 
 Array = NDArray[np.float64]
 
@@ -33,10 +33,10 @@ class Programme:
         self.motion, self.callbacks, self._bounds = motion, Callbacks(), bounds
         self._k, self._which = np.nonzero(held)
         self.lower, self.upper = bounds.lower[held], bounds.upper[held]
-        self._last: Evaluation | None = None
+        self._last: Linearisation | None = None
         self._row, self._column = self._pattern(x)
 
-    def at(self, x: Array) -> Evaluation:
+    def at(self, x: Array) -> Linearisation:
         """Evaluate, or remember."""
         if self._last is None or not np.array_equal(self._last.x, x):
             self._last = self.motion.evaluate(x)

@@ -37,7 +37,7 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Explanation:
     """What is known of one problem.
 
     Attributes:
@@ -55,7 +55,7 @@ class Finding:
 
 def explain_failure(
     problem: "Problem", robot: "Robot", boundary: Boundary, *, start_xyz: Array, goal_xyz: Array
-) -> Finding:
+) -> Explanation:
     """Say why no valid plan of a boundary problem was found.
 
     Args:
@@ -67,16 +67,16 @@ def explain_failure(
     """
     values = (start_xyz, goal_xyz, *vars(boundary).values())
     if not all(each is None or np.isfinite(each).all() for each in values):
-        return Finding(Kind.INFEASIBLE, "the boundary conditions are no numbers")
+        return Explanation(Kind.INFEASIBLE, "the boundary conditions are no numbers")
     for mistake in end_mistakes(problem, robot, boundary, start_xyz=start_xyz, goal_xyz=goal_xyz):
-        return Finding(Kind.INFEASIBLE, mistake)
+        return Explanation(Kind.INFEASIBLE, mistake)
     for mistake in _cannot_brake(problem, robot, boundary):
-        return Finding(Kind.INFEASIBLE, mistake)
-    unknown = Finding(Kind.UNKNOWN, "nothing proves that there is no valid plan")
+        return Explanation(Kind.INFEASIBLE, mistake)
+    unknown = Explanation(Kind.UNKNOWN, "nothing proves that there is no valid plan")
     return _off_table(problem, robot, boundary) or unknown
 
 
-def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[int, Finding]:
+def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[int, Explanation]:
     """Say of some plans' problems why no valid plan was found.
 
     Args:
@@ -121,7 +121,7 @@ def _cannot_brake(problem: "Problem", robot: "Robot", boundary: Boundary) -> Ite
                 yield f"{what} {name} is {over:.2g} rad or more outside its range, however it is accelerated"
 
 
-def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Finding | None:
+def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Explanation | None:
     """Say whether the tip must leave a table."""
     found = find_leaving(problem, robot, boundary)
     if found is None:
@@ -129,9 +129,9 @@ def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Findin
     where, distance = f"{_moment(found.end, found.time)} the tip", f"{1e3 * abs(found.distance):.2g} mm"
     if found.proven:
         text = f"{where} is {distance} or more off the table, however the joints are accelerated"
-        return Finding(Kind.INFEASIBLE, text)
+        return Explanation(Kind.INFEASIBLE, text)
     room = f"has {distance} of the table left" if found.distance < 0 else f"is {distance} off the table"
-    return Finding(Kind.VERGE, f"{where} {room} at best, as far as a local search without tolerances can tell")
+    return Explanation(Kind.VERGE, f"{where} {room} at best, as far as a local search without tolerances can tell")
 
 
 def _moment(end: str, time: float) -> str:

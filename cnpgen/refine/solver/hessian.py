@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.solver.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.transcription import Linearisation, Transcription
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -13,12 +13,12 @@ STEP = 1e-5  # of central differences, relative to the largest value along the m
 SMALL = 1e-2  # values below this are taken for this
 
 
-def lagrangian_hessian(motion: Transcription, at: Evaluation, multipliers: Array, weight: float = 1.0) -> Array:
+def lagrangian_hessian(motion: Transcription, at: Linearisation, multipliers: Array, weight: float = 1.0) -> Array:
     """Return the Hessian of ``weight * objective + multipliers . residuals``, shape (nx, nx).
 
     With w(x) the state of the splines at a phase and g(w) the residuals there, it is the sum over phases of
     ``(dw/dx)^T (lambda . d2g/dw2) dw/dx + (lambda . dg/dw) . d2w/dx2``. The objective's share is the positive
-    semidefinite model of ``Evaluation.curvature``; w depends on x linearly but for the logarithms of the rate.
+    semidefinite model of ``Linearisation.curvature``; w depends on x linearly but for the logarithms of the rate.
 
     Args:
         motion: The transcription.
@@ -40,7 +40,7 @@ def lagrangian_hessian(motion: Transcription, at: Evaluation, multipliers: Array
     return hessian + (inner + inner.T + outer + outer.T) / 2
 
 
-def _node_hessians(motion: Transcription, at: Evaluation, multipliers: Array, points: Indices) -> Array:
+def _node_hessians(motion: Transcription, at: Linearisation, multipliers: Array, points: Indices) -> Array:
     """Second derivatives of the residuals in w, weighted by the multipliers (m, P), at P phases: shape (P, W, W)."""
     w = motion.grid.bases.states(*motion.unpack(at.x))[:, points]
     width, count = w.shape
@@ -53,7 +53,7 @@ def _node_hessians(motion: Transcription, at: Evaluation, multipliers: Array, po
     return np.asarray(((slopes[0] - slopes[1]) / (2 * step[:, None])).transpose(2, 0, 1))
 
 
-def _rate_hessian(motion: Transcription, at: Evaluation, multipliers: Array, points: Indices) -> Array:
+def _rate_hessian(motion: Transcription, at: Linearisation, multipliers: Array, points: Indices) -> Array:
     """The second term: each log r has its own curvature, the first and last two bend the boundary points, too."""
     pull = replace(at, jacobian=np.einsum("wmk,km->wk", at.jacobian, multipliers)[:, None])
     only = np.zeros(len(points), np.intp)

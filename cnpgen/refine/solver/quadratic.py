@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.transcription import Linearisation, Transcription
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -42,7 +42,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Model:
+class QuadraticModel:
     """Quadratic model of the objective and linear one of the residuals near a point.
 
     Attributes:
@@ -55,7 +55,7 @@ class Model:
     """
 
     motion: Transcription
-    at: Evaluation
+    at: Linearisation
     bounds: Bounds
     violation: float
     proximal: float

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.quadratic import Mask, Model, Step, choose, crests
-from cnpgen.refine.solver.transcription import Evaluation, Transcription
+from cnpgen.refine.solver.quadratic import Mask, QuadraticModel, Step, choose, crests
+from cnpgen.refine.solver.transcription import Linearisation, Transcription
 
 Array = NDArray[np.float64]
 RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
@@ -112,7 +112,7 @@ class _Descent:
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
         at = motion.evaluate(x)
-        self._at: Evaluation | None = at
+        self._at: Linearisation | None = at
         self.x, self.cost, self.violation = x, at.cost, bounds.violation(at.g)
         self.ended = not self.violation < settings.far
         self._violations = [self.violation]
@@ -131,7 +131,7 @@ class _Descent:
         held = self._held(at)
         settings = self._settings
         proximal = LANDING if self._settled else settings.proximal
-        model = Model(self._motion, at, self._bounds, self.violation, proximal, settings.penalty)
+        model = QuadraticModel(self._motion, at, self._bounds, self.violation, proximal, settings.penalty)
         step = self._propose(model, held)
         if step is None:
             self._radius *= 0.25
@@ -146,14 +146,14 @@ class _Descent:
         least, enough = min(before, default=0.0), self._settings.violation_tolerance
         return least > enough and min(recent) > max(PROGRESS * least, enough)
 
-    def _held(self, at: Evaluation) -> Mask:
+    def _held(self, at: Linearisation) -> Mask:
         """Choose the residuals of the next quadratic programme."""
         near = next(near for length, near in NEAR if self._length > length)
         leaps = self._motion.leaps(at, LEAP * self._length)
         held = choose(at.g, self._bounds, thin=self._settings.thin, near=near, leaps=leaps) | self._missed
         return held if self._multipliers is None else held | (self._multipliers != 0)
 
-    def _propose(self, model: Model, held: Mask) -> Step | None:
+    def _propose(self, model: QuadraticModel, held: Mask) -> Step | None:
         """Solve the quadratic programme, again in other ways where that helps little."""
         box = self._radius * self._scale
         step = model.solve(held, box, warm=self._multipliers)
@@ -163,7 +163,7 @@ class _Descent:
             return model.solve(held, box)
         return step
 
-    def _try(self, model: Model, step: Step, held: Mask) -> None:
+    def _try(self, model: QuadraticModel, step: Step, held: Mask) -> None:
         """Take a step if it holds what it promised."""
         settings = self._settings
         x = self.x + step.dx

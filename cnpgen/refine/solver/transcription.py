@@ -28,7 +28,7 @@ SMOOTH_RATE = 1e-4  # weight of the squared second differences of log r: fixes t
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Linearisation:
     """Objective and residuals at one x, with their derivatives.
 
     Attributes:
@@ -51,7 +51,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class Stage:
+class ResidualKernels:
     """The kernels of a problem.
 
     Attributes:
@@ -79,7 +79,7 @@ class Transcription:
         tops: Heights of its obstacles [m], shape (obstacles,).
     """
 
-    def __init__(self, stage: Stage, grid: Grid, *, boundary: Boundary, tops: Array) -> None:
+    def __init__(self, stage: ResidualKernels, grid: Grid, *, boundary: Boundary, tops: Array) -> None:
         spec = stage.spec
         self.stage, self.spec, self.grid, self.boundary = stage, spec, grid, boundary
         self.n = boundary.start_q.shape[1]
@@ -142,7 +142,7 @@ class Transcription:
         """Return the motion time [s] of rate control points [1/s], shape (R,)."""
         return float(self.grid.weights @ (1.0 / (self.grid.gauss @ rate)))
 
-    def evaluate(self, x: Array) -> Evaluation:
+    def evaluate(self, x: Array) -> Linearisation:
         """Evaluate objective and residuals with their derivatives."""
         w, path, rate = self._at(x)
         g, jacobian = self.stage.jacobian(w, self._tops)
@@ -157,9 +157,9 @@ class Transcription:
         curvature[self.split :, self.split :] = half.T @ half + self._smooth
         if self.stage.criterion is not None:
             cost += self._add_criterion(path, rate, gradient, curvature)
-        return Evaluation(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
+        return Linearisation(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
 
-    def rows(self, at: Evaluation, k: Indices, which: Indices) -> Array:
+    def rows(self, at: Linearisation, k: Indices, which: Indices) -> Array:
         """Gradients of chosen residuals with respect to the variables.
 
         Args:
@@ -172,7 +172,7 @@ class Transcription:
         """
         return self._chain(at.jacobian[:, which, k].T, k, at.rate, self.grid.bases)
 
-    def leaps(self, at: Evaluation, step: float) -> Array:
+    def leaps(self, at: Linearisation, step: float) -> Array:
         """Bound how far r' alone can carry residuals when no log r changes by more than ``step``, shape (K, m)."""
         change = np.abs(self.grid.bases.rate[1]) @ at.rate * step
         reach: Array = np.abs(at.jacobian[3 * self.n + 1]).T * change[:, None]
