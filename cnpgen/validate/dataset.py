@@ -83,7 +83,7 @@ class ValidationReport:
             ]
         if self.plans:
             lines.append(
-                f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'blueprint')}, {self.plans[1]:,} valid"
+                f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid"
             )
         if self.wanted:
             lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")

@@ -1,0 +1,207 @@
+"""Every block in the README and the docs runs as it is shown."""
+
+import configparser
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.world.path import PathWorld
+from cnpgen.world.state import World
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
+RUNNABLE = {"bash", "python", "toml"}
+
+
+def blocks(page: Path) -> list[tuple[dict[str, str], str, str]]:
+    """Return (markers, language, text) of the fenced blocks of a page."""
+    found = []
+    for marks, language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
+        pairs = re.findall(r"<!-- (\w+)(?:: (\S+))? -->", marks)
+        found.append((dict(pairs), language, text))
+    return found
+
+
+def environment(folder: Path) -> dict[str, str]:
+    binaries = Path(sys.executable).parent
+    paths = [str(folder / "src"), os.environ.get("PYTHONPATH", "")]
+    return {
+        **os.environ,
+        "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": os.pathsep.join(path for path in paths if path),
+        "MPLBACKEND": "Agg",
+    }
+
+
+def run(command: list[str], folder: Path, code: int = 0) -> str:
+    done = subprocess.run(
+        command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout if code == 0 else done.stdout + done.stderr
+
+
+def test_every_block_says_what_it_is() -> None:
+    for page in PAGES:
+        for marks, language, text in blocks(page):
+            assert language in RUNNABLE | {""}, f"{page.name}: {language!r} cannot be run: {text[:60]}"
+            assert language != "toml" or "file" in marks, f"{page.name}: a TOML block must be a file: {text[:60]}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_blocks_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
+    for marks, language, text in blocks(page):
+        if "needs" in marks and not (tmp_path / marks["needs"]).exists():
+            out = ["--n", "400", "--workers", "1", "--out", marks["needs"]]
+            run([sys.executable, "-m", "cnpgen", "make-dataset", "airhockey-hit", *out], tmp_path)
+        if "library" in marks and find_spec(marks["library"]) is None:
+            continue  # .ci/run or the extended run has it
+        if "install" in marks or "test" in marks:
+            continue  # .ci/run runs these two in fresh environments
+        if "file" in marks:
+            path = tmp_path / marks["file"]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        elif language == "bash":
+            run(["bash", "-euo", "pipefail", "-c", text], tmp_path)
+        elif language == "python":
+            run([sys.executable, "-c", text], tmp_path)
+
+
+WRITTEN = {
+    "bash": re.compile(r"(?:-o|--out|--plot|>) ([\w.-]+)"),
+    "python": re.compile(r'(?:save_plans\("|make_dataset\("[\w-]+", "|File\("(?=[^"]+", "w"))([\w.-]+)'),
+}
+
+
+def test_no_two_pages_write_the_same_file_so_that_all_can_run_in_one_folder() -> None:
+    pages: dict[str, set[str]] = {}
+    for page in PAGES:
+        for marks, language, text in blocks(page):
+            if language in WRITTEN and not {"install", "test"} & marks.keys():
+                for name in WRITTEN[language].findall(text):
+                    pages.setdefault(Path(name).stem, set()).add(page.name)
+    assert len(pages) > 15
+    assert {name: names for name, names in pages.items() if len(names) > 1} == {}
+
+
+def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
+    files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
+    source = tmp_path / "src"
+    source.mkdir()
+    (source / "my_hockey.py").write_text(files["src/my_hockey.py"], encoding="utf-8")
+    install(source, tomllib.loads(files["pyproject.toml"])["project"])
+    shipped = ROOT / "problems" / "airhockey"
+    problem = (shipped / "problem.toml").read_text(encoding="utf-8")
+    problem = problem.replace('urdf = "', f'urdf = "{shipped}/')
+    problem += '\n[[constraint]]\nuse = "keep-out"\nx = "1.0 m"\ny = "0 m"\nradius = "10 cm"\ntolerance = "1 mm"\n'
+    pipeline = (ROOT / "pipelines" / "airhockey-hit.toml").read_text(encoding="utf-8")
+    pipeline = pipeline.replace('problem = "airhockey"', 'problem = "./problem.toml"')
+    pipeline += '\n[[stage]]\nuse = "slow-hits"\nmax_speed = "1 m/s"\n'
+    (tmp_path / "problem.toml").write_text(problem, encoding="utf-8")
+    (tmp_path / "slow.toml").write_text(pipeline, encoding="utf-8")
+
+    assert "slow-hits" in run(["cnpgen", "list"], tmp_path)
+    run(["cnpgen", "make-dataset", "slow.toml", "--n", "300", "--workers", "1", "--out", "slow"], tmp_path)
+    run(["cnpgen", "validate", "slow", "--deep", "--workers", "1"], tmp_path)
+    rejected = run(["cnpgen", "inspect", "slow"], tmp_path)
+    assert "hit too fast" in rejected
+    assert "in the circle" in rejected
+
+    code = (source / "my_hockey.py").read_text(encoding="utf-8")
+    (source / "my_hockey.py").write_text(
+        code.replace("<= self.max_speed,", "<= 0.5 * self.max_speed,"), encoding="utf-8"
+    )
+    changed = run(["cnpgen", "validate", "slow", "--regenerate", "1"], tmp_path, code=1)
+    assert "made with other versions: the code of its plug-ins has changed" in changed
+
+    (source / "my_hockey-1.0.dist-info" / "entry_points.txt").unlink()  # as if it were not installed
+    run(["cnpgen", "validate", "slow"], tmp_path)
+    lost = run(["cnpgen", "validate", "slow", "--deep"], tmp_path, code=3)
+    assert "stage 'slow-hits' comes from the package 'my-hockey', which is not installed" in lost
+    assert "constraint 'keep-out' comes from the package 'my-hockey', which is not installed" in lost
+
+
+def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states() -> None:
+    files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
+    module: dict[str, Any] = {"__name__": "my_hockey"}
+    exec(compile(files["src/my_hockey.py"], "my_hockey.py", "exec"), module)
+    keep_out = module["KeepOut"](x=1.0, y=0.0, radius=0.1, tolerance=1e-3)
+    problem = load_problem("airhockey")
+    robot = load_robot(problem)
+    q = np.linspace(robot.base, 0.5 * robot.base, 20).T
+    path, world, still = (
+        PathWorld(robot, problem.obstacle, problem.object_size),
+        World(robot, problem.obstacle, problem.object_size),
+        np.zeros((robot.n, 20)),
+    )
+    path.set_path(q, still, still, np.zeros(0))
+    (along,) = keep_out.measured(path)
+    single = []
+    for state in q.T.copy():
+        world.set_state(state, still[:, 0], still[:, 0], np.zeros(0))
+        single.append(keep_out.measured(world)[0].g[0])
+    np.testing.assert_allclose(along.g[0], single, rtol=1e-12)
+    assert np.ptp(single) > 0.01
+
+
+def install(folder: Path, project: dict[str, object]) -> None:
+    """Do what pip does for entry points: write the metadata beside the module."""
+    info = folder / f"{str(project['name']).replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    entry_points = configparser.ConfigParser(delimiters=("=",))
+    entry_points.read_dict(project["entry-points"])  # type: ignore[arg-type]
+    with (info / "entry_points.txt").open("w", encoding="utf-8") as file:
+        entry_points.write(file)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    titles = re.findall(r"^#+ +(.+?) *$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+LINKED = sorted({*PAGES, *ROOT.glob("*.md")})
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
+def test_what_a_page_links_to_is_there(page: Path) -> None:
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.S)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", link):
+            continue
+        file, _, anchor = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.exists(), f"{page.name} links to {link}"
+        assert not anchor or anchor in anchors(target), f"{page.name} links to {link}; there are {anchors(target)}"
+
+
+def test_every_page_can_be_reached_from_the_readme() -> None:
+    seen, waiting = set[Path](), [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page in seen or page.suffix != ".md":
+            continue
+        seen.add(page)
+        links = re.findall(r"\]\(([^)\s#:]+)[^)]*\)", page.read_text(encoding="utf-8"))
+        waiting += [path for link in links if (path := (page.parent / link).resolve()).is_file()]
+    assert {*PAGES} <= seen, f"nothing links to {[page.name for page in {*PAGES} - seen]}"
+
+
+def test_no_page_has_a_placeholder_left() -> None:
+    for page in PAGES:
+        for line in page.read_text(encoding="utf-8").splitlines():
+            assert not re.fullmatch(r"[A-Z]{4,}", line), f"{page.name}: {line}"

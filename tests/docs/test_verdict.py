@@ -1,0 +1,40 @@
+"""The page on the verdict names every key of the JSON, and no other."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+from cnpgen.judges.plans import Reason
+from cnpgen.plans.evaluate import evaluate_plans
+from tests.examples.plan_files import plans_of
+from tests.examples.plans import load
+
+PAGE = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text(encoding="utf-8")
+
+
+def documented(after: str) -> set[str]:
+    """Keys in the first column of the first table after a text."""
+    table = re.search(r"\| key \|.*?\n\n", PAGE[PAGE.index(after) :] + "\n\n", re.S)
+    assert table
+    return {key for row in table[0].splitlines()[2:] if row for key in re.findall(r"`([^`]+)`", row.split("|")[1])}
+
+
+def test_every_key_is_documented() -> None:
+    plan = load("dragging")
+    found = evaluate_plans(plans_of(plan))
+    (verdict,) = found.rows()
+    margin: dict[str, Any] = verdict["worst"]
+    assert documented("\n## JSON") == {"file", "verdicts", *found.summary()}
+    assert documented("\nA verdict:") == set(verdict)
+    assert documented("\nA margin says") == set(margin)
+    for name in ("mean", "median", "p95", "max", "plans_out", "worst_plan", "finished", "broken"):
+        assert f"`{name}`" in PAGE
+    assert set(found.summary()["conditions"]["tilt"]) == {"plans_out", "worst_plan", *margin}
+
+
+def test_every_metric_and_reason_is_documented() -> None:
+    for label in ("hit", "transport"):
+        for name in load(label).judged().metrics.to_dict():
+            assert f"| `{name}` |" in PAGE
+    for reason in Reason:
+        assert f"`{reason}`" in PAGE

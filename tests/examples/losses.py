@@ -1,0 +1,117 @@
+"""Batches of bent plans for the tests of the loss, and an evaluation of it by other means."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.interpolate import BSpline
+
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.world.state import World
+from tests.examples.plans import KNOTS, PROBLEMS, ROBOTS, load
+
+LABELS = ("hit", "transport")
+PROBLEM_OF = {"hit": "airhockey", "replan": "airhockey", "transport": "heavy-object"}
+
+
+@cache
+def loss(problem: str, **options: Any) -> PlanLoss:
+    """A loss of a shipped problem, built once per session."""
+    return PlanLoss(PROBLEMS[problem], **{"dtype": "float64", **options})
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Arguments of a loss."""
+
+    problem: str
+    path: np.ndarray
+    rate: np.ndarray
+    tops: np.ndarray
+
+    def __getitem__(self, rows: Any) -> "Batch":
+        return Batch(self.problem, self.path[rows], self.rate[rows], self.tops[rows])
+
+    def evaluated(self, of: PlanLoss, **options: Any) -> Any:
+        weights = np.linspace(1.0, 2.0, len(of.terms) - 1)
+        return of(self.path, self.rate, **{"weights": weights, "tops": self.tops, **options})
+
+
+def batch(label: str, count: int, by: float = 0.1, seed: int = 0, raised: float = 0.25) -> Batch:
+    """A stored plan with all its control points moved by up to ``by`` rad, at other rates and between other obstacles.
+
+    Also the ends are moved: at rest, or with an object exactly upright, the loss has kinks.
+    """
+    plan = load(label)
+    random = np.random.default_rng(seed)
+    path = plan.motion.path + by * random.uniform(-1, 1, (count, *plan.motion.path.shape[1:]))
+    rate = plan.motion.rate * random.uniform(0.9, 1.4, (count, plan.motion.rate.shape[1]))
+    tops = np.repeat(obstacle_tops(plan.problem, plan.start_xyz, plan.goal_xyz), count, axis=0)
+    tops += random.uniform(-0.02, raised, tops.shape)  # obstacles that reach into the arm's way
+    return Batch(PROBLEM_OF[label], path, rate, tops)
+
+
+@dataclass(frozen=True)
+class States:
+    """States at K phases of one plan, from SciPy's splines; measured by Pinocchio and Coal."""
+
+    q: np.ndarray
+    dq: np.ndarray
+    ddq: np.ndarray
+    rate: np.ndarray
+
+
+def states(path: np.ndarray, rate: np.ndarray, s: np.ndarray) -> States:
+    p, r = BSpline(KNOTS[len(path)], path, 7), BSpline(KNOTS[len(rate)], rate, 7)
+    r0, r1 = r(s)[:, None], r(s, 1)[:, None]
+    return States(p(s), p(s, 1) * r0, p(s, 2) * r0**2 + p(s, 1) * r1 * r0, r0[:, 0])
+
+
+def huber(x: np.ndarray) -> np.ndarray:
+    """The paper's: quadratic up to 1, linear beyond."""
+    return np.where(np.abs(x) < 1, 0.5 * x**2, np.abs(x) - 0.5)
+
+
+def step_losses(problem: str, at: States, tops: np.ndarray) -> np.ndarray:
+    """Task loss and Huber(ReLU(violation)) of every constraint at every state, by Pinocchio and Coal, shape (K, 1 + m).
+
+    Robot clearance is only right where the robot does not enter an obstacle: Coal's distance of a segment is 0 there.
+    """
+    robot, chosen = ROBOTS[problem], PROBLEMS[problem]
+    world, rows = World(robot, chosen.obstacle, chosen.object_size), []
+    for q, dq, ddq in zip(at.q, at.dq, at.ddq, strict=True):
+        world.set_state(q, dq, ddq, tops)
+        row = [1 + chosen.objective.centrifugal * centrifugal(problem, q, dq, ddq)]
+        for constraint in chosen.constraint:
+            conditions = constraint.measured(world)
+            below = [np.maximum(c.lower - np.array(c.g, float), 0) for c in conditions]
+            above = [np.maximum(np.array(c.g, float) - c.upper, 0) for c in conditions]
+            row.append(float(huber(np.concatenate(below + above)).sum()))
+        rows.append(row)
+    return np.array(rows)
+
+
+def centrifugal(problem: str, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
+    """Curvature of the tip's path times its squared speed [m/s^2], by Pinocchio, rounded off as the loss does."""
+    robot = ROBOTS[problem]
+    model, data = robot.model, robot.model.createData()
+    tip, frame = model.getFrameId(robot.tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    pin.forwardKinematics(model, data, q, dq, ddq)
+    v = pin.getFrameVelocity(model, data, tip, frame).linear
+    a = pin.getFrameClassicalAcceleration(model, data, tip, frame).linear
+    return float(np.sqrt(np.sum(np.cross(v, a) ** 2) / (v @ v + 1e-4) + 0.05**2) - 0.05)
+
+
+def with_weight(of: PlanLoss, term: int) -> np.ndarray:
+    """Weights with which only one constraint term counts beside the time."""
+    weights = np.zeros(len(of.terms) - 1)
+    weights[term] = 3.0
+    return weights
+
+
+def moved(given: Batch, path: np.ndarray, rate: np.ndarray) -> Batch:
+    """The batch with other control points."""
+    return replace(given, path=path, rate=rate)

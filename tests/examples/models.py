@@ -1,0 +1,81 @@
+"""Small models for the tests: trained for a moment on the small datasets, once per session."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.planner.kit import Surroundings, make_kit
+from cnpgen.planner.landing import make_landing
+from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.network.architecture import Architecture, initial_parameters
+from cnpgen.problems.record import record_problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.training.rows import Rows, prepare_rows, resting
+from cnpgen.training.settings import TrainingSettings
+from cnpgen.training.step import Learner
+from cnpgen.trajectory.boundary import Boundary
+
+SMALL = TrainingSettings(hidden=16, layers=2, batch_size=32, nodes=16)
+
+
+@cache
+def surroundings_of(name: str) -> Surroundings:
+    """A shipped problem with its robot and the kernels of this machine."""
+    from tests.examples.plans import PROBLEMS
+
+    problem = PROBLEMS[name]
+    robot, (backend, folder) = load_robot(problem), choose_backend()
+    record = record_problem(problem)
+    kernels = KernelLibrary(backend, folder, record.digest, {"robot": robot, "problem": problem})
+    return Surroundings(record, problem, robot, kernels)
+
+
+def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
+    names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+    return Boundary(*(np.asarray(columns[name][:rows], float) for name in names))
+
+
+def architecture_of(given: Surroundings, rows: Rows, settings: TrainingSettings) -> Architecture:
+    return Architecture(
+        inputs=rows.features.shape[1],
+        hidden=settings.hidden,
+        layers=settings.layers,
+        path_outputs=10 * given.robot.n,
+        rate_outputs=20,
+    )
+
+
+def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
+    """A model of a problem with random parameters: plans are bad, but plans."""
+    given = surroundings_of(name)
+    kit = make_kit(given, bending_steps=1, landing_steps=1, slow_down=False)
+    rows, features = prepare_rows(boundary, kit.prepare)
+    architecture = architecture_of(given, rows, SMALL)
+    options = {
+        "problem": given.record,
+        "architecture": architecture,
+        "parameters": initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-0.5),
+        "features": features,
+        "meaning": Meaning(path_scale=0.3, bending_steps=1, landing_steps=1),
+        "rest": resting(boundary),
+    }
+    return Model(**{**options, **changes})
+
+
+def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
+    """What one step of training needs, in float32 or float64."""
+    given = surroundings_of(name)
+    kit = make_kit(given, bending_steps=settings.bending_steps, landing_steps=settings.landing_steps, slow_down=False)
+    landing = make_landing(given.problem, given.kernels, steps=settings.landing_steps)
+    rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
+    loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
+    architecture = architecture_of(given, rows, settings)
+    return Learner(architecture, given.problem.trajectory, loss, settings, landing), rows
+
+
+def model_path(folder: Path) -> Path:
+    return folder / "model.h5"

@@ -1,0 +1,136 @@
+"""Plans for the tests of the verdict: stored right ones, ways to bend them, and an evaluation by other means."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import simpson
+from scipy.interpolate import BSpline
+
+from cnpgen.judges.plans import Verdict, judge
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+
+PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
+ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
+CONTENT = json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text())
+KNOTS = {count: np.r_[np.zeros(8), np.arange(1, count - 7) / (count - 7), np.ones(8)] for count in (15, 20)}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One plan and its problem: what ``judge`` is asked about."""
+
+    problem: Problem
+    robot: Robot
+    motion: Motion
+    boundary: Boundary
+    start_xyz: np.ndarray
+    goal_xyz: np.ndarray
+
+    def judged(self, **options: Any) -> Verdict:
+        (verdict,) = judge(
+            self.problem, self.robot, self.motion, self.boundary, self.start_xyz, self.goal_xyz, **options
+        )
+        return verdict
+
+    def changed(self, *, path: np.ndarray | None = None, rate: np.ndarray | None = None) -> "Plan":
+        old = self.motion
+        return replace(self, motion=Motion(old.path if path is None else path, old.rate if rate is None else rate))
+
+    def with_constraint(self, kind: str, **changes: Any) -> "Plan":
+        """The same plan in a problem with one constraint changed."""
+        constraints = tuple(
+            replace(constraint, **changes) if type(constraint).__name__ == kind else constraint
+            for constraint in self.problem.constraint
+        )
+        return replace(self, problem=replace(self.problem, constraint=constraints))
+
+
+def load(label: str) -> Plan:
+    content = CONTENT[label]
+    value = {name: np.array(values)[None] for name, values in content.items() if name != "problem"}
+    boundary = Boundary(*(value[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")))
+    name = content["problem"]
+    motion = Motion(value["path"], value["rate"])
+    return Plan(PROBLEMS[name], ROBOTS[name], motion, boundary, value["start_xyz"], value["goal_xyz"])
+
+
+def joined(*plans: Plan) -> tuple[Any, ...]:
+    """Arguments of ``judge`` for several plans of one problem."""
+
+    def stack(values: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate(values)
+
+    names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+    boundary = Boundary(*(stack([getattr(plan.boundary, name) for plan in plans]) for name in names))
+    motion = Motion(stack([plan.motion.path for plan in plans]), stack([plan.motion.rate for plan in plans]))
+    xyz = (stack([plan.start_xyz for plan in plans]), stack([plan.goal_xyz for plan in plans]))
+    return plans[0].problem, plans[0].robot, motion, boundary, *xyz
+
+
+def bent(plan: Plan, by: float, *, seed: int = 0) -> Plan:
+    """The plan with its interior control points moved by up to ``by`` rad."""
+    path = plan.motion.path.copy()
+    path[:, 3:13] += by * np.random.default_rng(seed).uniform(-1, 1, path[:, 3:13].shape)
+    return plan.changed(path=path)
+
+
+def raised(plan: Plan, by: float) -> Plan:
+    """The problem of a plan, starting with the tip ``by`` [m] above the table."""
+    table = next(each for each in plan.problem.constraint if type(each).__name__ == "Table")
+    goal, q = np.r_[plan.start_xyz[0, :2], table.z + by], plan.boundary.start_q[0]
+    model, frame = plan.robot.model, plan.robot.model.getFrameId(plan.robot.tip)
+    data, axes = model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for _ in range(20):
+        pin.computeJointJacobians(model, data, q)
+        off = goal - pin.updateFramePlacement(model, data, frame).translation
+        q = q + np.linalg.pinv(pin.getFrameJacobian(model, data, frame, axes)[:3]) @ off
+    return replace(plan, boundary=replace(plan.boundary, start_q=q[None]), start_xyz=goal[None])
+
+
+@dataclass(frozen=True)
+class Course:
+    """A plan evaluated with SciPy's splines and Pinocchio, at many phases."""
+
+    s: np.ndarray
+    t: np.ndarray
+    q: np.ndarray
+    dq: np.ndarray
+    ddq: np.ndarray
+    jerk: np.ndarray
+    tau: np.ndarray
+    tip: np.ndarray
+    rotation: np.ndarray
+
+    def integral(self, values: np.ndarray) -> float:
+        return float(simpson(values, x=self.t))
+
+
+def course(plan: Plan, count: int = 4001) -> Course:
+    s = np.linspace(0, 1, count)
+    path, rate = plan.motion.path[0], plan.motion.rate[0]
+    p, r = BSpline(KNOTS[15], path, 7), BSpline(KNOTS[20], rate, 7)
+    q, r0 = p(s), r(s)[:, None]
+    dq, ddq = p(s, 1) * r0, p(s, 2) * r0**2 + p(s, 1) * r(s, 1)[:, None] * r0
+    jerk = (p(s, 3) * r0**2 + 3 * p(s, 2) * r(s, 1)[:, None] * r0) * r0
+    jerk += p(s, 1) * (r(s, 2)[:, None] * r0 + r(s, 1)[:, None] ** 2) * r0
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    middle, half = (s[1:] + s[:-1]) / 2, np.diff(s)[:, None] / 2
+    t = np.concatenate([[0], np.cumsum((half / r(middle[:, None] + half * nodes)) @ weights)])
+    model, data = plan.robot.model, plan.robot.model.createData()
+    tip = model.getFrameId(plan.robot.tip)
+    poses, tau = [], []
+    for state in zip(q, dq, ddq, strict=True):
+        tau.append(np.array(pin.rnea(model, data, *state)))
+        pin.framesForwardKinematics(model, data, state[0])
+        poses.append(data.oMf[tip].copy())
+    rotation = np.array([pose.rotation for pose in poses])
+    return Course(s, t, q, dq, ddq, jerk, np.array(tau), np.array([pose.translation for pose in poses]), rotation)

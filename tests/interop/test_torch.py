@@ -1,0 +1,466 @@
+"""The bridge to torch, against torch itself."""
+
+# ruff: noqa: E402 - without the framework nothing else is imported
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.examples.loader import ALL, columns, ids, make
+from tests.examples.plans_of_networks import at_ends, boundary, outputs
+
+torch = pytest.importorskip("torch")
+
+from torch.utils.data import DataLoader
+
+from cnpgen.errors import UsageError
+from cnpgen.interop.torch import BatchDataset, RowDataset, control_points, plan_loss, to_torch
+from cnpgen.loader import order
+from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.load import load_dataset
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.planner.omega import Omega
+from cnpgen.problems.load import load_problem
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning"),  # than the machine has cores
+]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_dataset(make(tmp_path_factory.mktemp("loader") / "set", shard_size=8))
+
+
+def rows(loader: Any) -> list[list[int]]:
+    return [batch["sample_id"].tolist() for batch in loader]
+
+
+def test_tensors_have_the_batch_s_numbers_in_the_batch_s_memory(dataset: Dataset) -> None:
+    batch = next(iter(dataset.batches(8, fields=ALL)))
+    tensors = to_torch(batch)
+    assert list(tensors) == list(ALL)
+    for name, values in batch.items():
+        assert np.array_equal(tensors[name].numpy(), values)
+        assert tensors[name].shape == values.shape
+        assert np.shares_memory(tensors[name].numpy(), values)
+    assert tensors["start_q"].dtype == torch.float32
+    assert tensors["sample_id"].dtype == torch.int64
+
+
+def test_a_batch_travels_as_one_table_and_has_views_of_it_there(dataset: Dataset) -> None:
+    batch = next(iter(dataset.batches(8, fields=ALL)))
+    tensors = to_torch(batch)
+    assert np.shares_memory(tensors.table.numpy(), batch.table)
+    there = tensors.to("meta")  # a device without numbers
+    assert there.table.is_meta
+    assert all(there[name].is_meta and there[name].shape == tensors[name].shape for name in ALL)
+    assert all(there[name]._base is there.table for name in ALL if name != "sample_id")
+    assert tensors.columns == batch.columns
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_table_comes_through_a_data_loader(dataset: Dataset, workers: int) -> None:
+    loader = DataLoader(BatchDataset(dataset.batches(8, fields=ALL)), batch_size=None, num_workers=workers)
+    for found, batch in zip(loader, dataset.batches(8, fields=ALL), strict=True):
+        assert np.array_equal(found.table.numpy(), batch.table)
+        assert np.array_equal(found.to("cpu")["goal_p"].numpy(), batch["goal_p"])
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("batch_size", [1, 2])
+def test_batches_of_batches_are_refused(dataset: Dataset, workers: int, batch_size: int) -> None:
+    loader = DataLoader(BatchDataset(dataset.batches(8)), batch_size=batch_size, num_workers=workers)
+    with pytest.raises(UsageError, match="give the DataLoader of a BatchDataset batch_size=None"):
+        next(iter(loader))
+
+
+def test_tensors_are_normalised_and_back_like_arrays(dataset: Dataset) -> None:
+    batch, normalization = next(iter(dataset.batches(8, fields=ALL))), dataset.normalization
+    assert normalization is not None
+    expected, found = normalization.denormalize(batch), normalization.denormalize(to_torch(batch))
+    for name, values in found.items():
+        assert isinstance(values, torch.Tensor)
+        np.testing.assert_allclose(values, expected[name], rtol=1e-6, atol=1e-6)
+        assert values.numpy().dtype == batch[name].dtype
+    again = normalization.normalize(found)
+    assert all(np.allclose(again[name], batch[name], atol=1e-5) for name in batch)
+
+
+def test_gradients_go_through_denormalisation(dataset: Dataset) -> None:
+    normalization = dataset.normalization
+    assert normalization is not None
+    values = torch.zeros((4, 3), dtype=torch.float64, requires_grad=True)
+    normalization.denormalize({"start_q": values})["start_q"].sum().backward()
+    np.testing.assert_allclose(values.grad, np.tile(normalization.std["start_q"], (4, 1)))
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2, 3])
+@pytest.mark.parametrize("drop_last", [True, False])
+def test_a_data_loader_gives_the_same_batches_with_any_number_of_workers(
+    dataset: Dataset, workers: int, drop_last: bool
+) -> None:
+    wanted = BatchDataset(dataset.batches(7, fields=ALL, drop_last=drop_last))
+    loader = DataLoader(wanted, batch_size=None, num_workers=workers)
+    expected = list(dataset.batches(7, fields=ALL, drop_last=drop_last))
+    assert len(loader) == len(expected)
+    for found, batch in zip(loader, expected, strict=True):
+        assert list(found) == list(batch)
+        assert all(np.array_equal(found[name].numpy(), batch[name]) for name in batch)
+
+
+def test_workers_may_be_spawned(dataset: Dataset) -> None:
+    loader = DataLoader(
+        BatchDataset(dataset.batches(7, fields=ALL)), batch_size=None, num_workers=1, multiprocessing_context="spawn"
+    )
+    assert rows(loader) == ids(dataset.batches(7, fields=ALL))
+
+
+def test_without_workers_every_loop_is_the_next_epoch(dataset: Dataset) -> None:
+    loader = DataLoader(BatchDataset(dataset.batches(10, fields=ALL)), batch_size=None)
+    assert [rows(loader) for _ in range(3)] == [ids(dataset.batches(10, fields=ALL, epoch=e)) for e in range(3)]
+
+
+@pytest.mark.parametrize("persistent", [True, False])
+def test_with_workers_every_loop_is_the_next_epoch_too(dataset: Dataset, persistent: bool) -> None:
+    wanted = BatchDataset(dataset.batches(10, fields=ALL, epoch=1))
+    loader = DataLoader(wanted, batch_size=None, num_workers=2, persistent_workers=persistent)
+    expected = {epoch: ids(dataset.batches(10, fields=ALL, epoch=epoch)) for epoch in range(6)}
+    assert [rows(loader) for _ in range(2)] == [expected[1], expected[2]]
+    next(iter(loader))  # leaves epoch 3 early
+    assert rows(loader) == expected[4]
+    wanted.set_epoch(0)
+    assert [rows(loader) for _ in range(2)] == [expected[0], expected[1]]
+
+
+def test_a_state_that_is_loaded_between_two_loops_counts_in_workers_too(dataset: Dataset) -> None:
+    batches = dataset.batches(10, fields=ALL)
+    loader = DataLoader(BatchDataset(batches), batch_size=None, num_workers=2)
+    state, expected = batches.state(batch=2), ids(dataset.batches(10, fields=ALL))
+    for _ in range(2):
+        assert rows(loader) == expected
+        batches.load_state(state)
+        assert rows(loader) == expected[2:]
+        batches.epoch = 0
+
+
+@pytest.mark.parametrize("persistent", [True, False])
+def test_workers_are_told_the_epoch(dataset: Dataset, persistent: bool) -> None:
+    wanted = BatchDataset(dataset.batches(10, fields=ALL))
+    loader = DataLoader(wanted, batch_size=None, num_workers=2, persistent_workers=persistent)
+    for epoch in (0, 1, 2, 0):
+        wanted.set_epoch(epoch)
+        assert rows(loader) == ids(dataset.batches(10, fields=ALL, epoch=epoch))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_training_resumes_after_any_number_of_used_batches(dataset: Dataset, workers: int) -> None:
+    expected = ids(dataset.batches(6, fields=ALL, epoch=1))
+    for used in range(len(expected)):
+        batches = dataset.batches(6, fields=ALL)
+        wanted = BatchDataset(batches)
+        batches.load_state(dataset.batches(6).state(epoch=1, batch=used))
+        if used % 2:
+            wanted.set_epoch(1)  # changes nothing
+        assert rows(DataLoader(wanted, batch_size=None, num_workers=workers)) == expected[used:]
+
+
+def test_a_worker_in_the_middle_of_windows_gets_its_share(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(order, "WINDOW_ROWS", 16)
+    loader = DataLoader(BatchDataset(dataset.batches(3, fields=ALL)), batch_size=None, num_workers=2)
+    assert rows(loader) == ids(dataset.batches(3, fields=ALL))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_rows_are_read_batch_by_batch_in_torch_s_own_order(dataset: Dataset, workers: int) -> None:
+    wanted = RowDataset(dataset, fields=ALL, normalize=False, dtype="float64")
+    generator = torch.Generator().manual_seed(3)
+    loader = DataLoader(
+        wanted, batch_size=16, shuffle=True, generator=generator, collate_fn=wanted.collate, num_workers=workers
+    )
+    assert len(wanted) == 50
+    found = list(loader)
+    assert [len(batch["start_q"]) for batch in found] == [16, 16, 16, 2]
+    seen = np.concatenate([batch["sample_id"] for batch in found])
+    assert sorted(seen.tolist()) == list(range(50)) != seen.tolist()
+    for name, values in columns(shard_size=8).items():
+        assert np.array_equal(np.concatenate([batch[name] for batch in found]), values[seen])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_rows_need_no_collate_fn_and_may_be_split_at_random(dataset: Dataset, workers: int) -> None:
+    wanted = RowDataset(dataset, fields=ALL)
+    one, other = torch.utils.data.random_split(wanted, [30, 20])
+    expected = dataset.rows("train", range(50), fields=ALL, normalize=True, dtype="float32")
+    for part, options in (
+        (wanted, {}),
+        (wanted, {"batch_sampler": [[3, 1], [49]]}),
+        (one, {}),
+        (other, {"shuffle": 1}),
+    ):
+        for collate in (None, wanted.collate):
+            kind = {"batch_size": 16} if "batch_sampler" not in options else {}
+            loader = DataLoader(part, **options, **kind, collate_fn=collate, num_workers=workers)
+            found = list(loader)
+            assert sum(len(batch["start_q"]) for batch in found) == (3 if "batch_sampler" in options else len(part))
+            for batch in found:
+                for name, values in batch.items():
+                    assert np.array_equal(values.numpy(), expected[name][batch["sample_id"].numpy()])
+
+
+def test_a_concatenation_of_row_datasets_can_be_collated(dataset: Dataset) -> None:
+    wanted = RowDataset(dataset, fields=ALL)
+    loader = DataLoader(wanted + wanted, batch_size=60, collate_fn=wanted.collate)
+    assert rows(loader) == [[*range(50), *range(10)], [*range(10, 50)]]
+
+
+def test_single_rows_are_read_too(dataset: Dataset) -> None:
+    wanted = RowDataset(dataset)
+    assert list(wanted[4]) == ["start_q", "goal_p"]
+    assert wanted[4]["start_q"].dtype == torch.float32
+    expected = dataset.rows("train", [4], normalize=True, dtype="float32")
+    assert np.array_equal(wanted[4]["goal_p"].numpy(), expected["goal_p"][0])
+
+
+# The loss.
+
+
+@pytest.fixture(scope="module")
+def loss(cache_folder: Path, fastest: Any) -> Callable[..., PlanLoss]:
+    return lambda problem, dtype="float64": PlanLoss(
+        load_problem(problem), dtype=dtype, nodes=12, backend=fastest, cache_folder=cache_folder
+    )
+
+
+def plans(problem: str, count: int, dtype: Any = torch.float64) -> dict[str, Any]:
+    """Draw plans, weights and, where there are obstacles, their heights."""
+    found, random = load_problem(problem), np.random.default_rng(1)
+    base, spec = np.array(found.robot.base), found.trajectory
+    path = base + 0.3 * random.standard_normal((count, spec.path_control_points, len(base)))
+    tensors = {
+        "path": path,
+        "rate": random.uniform(1.0, 2.0, (count, spec.rate_control_points)),
+        "weights": random.uniform(0.5, 2.0, len(found.constraint)),
+    }
+    if problem == "heavy-object":
+        tensors["tops"] = random.uniform(0.2, 0.4, (count, 2))
+    return {name: torch.tensor(values, dtype=dtype) for name, values in tensors.items()}
+
+
+@pytest.mark.parametrize("problem", ["airhockey", "heavy-object"])
+def test_the_loss_s_gradients_are_those_that_torch_finds_by_differences(loss: Any, problem: str) -> None:
+    of, given = loss(problem), plans(problem, 2)
+    variables = [given.pop(name).requires_grad_() for name in ("path", "rate", "weights")]
+
+    def total(path: Any, rate: Any, weights: Any) -> Any:
+        return plan_loss(of, path, rate, weights=weights, **given)[0]
+
+    assert torch.autograd.gradcheck(total, variables, eps=1e-6, rtol=1e-5, atol=1e-5)
+
+
+def test_the_loss_is_that_of_numpy_and_a_sum_of_its_terms(loss: Any) -> None:
+    of, given = loss("airhockey"), plans("airhockey", 5)
+    total, terms = plan_loss(of, **given)
+    expected = of(**{name: values.numpy() for name, values in given.items()})
+    assert np.array_equal(total.numpy(), expected.total)
+    assert np.array_equal(terms.numpy(), expected.terms)
+    assert not terms.requires_grad
+
+
+def test_gradients_reach_the_network_that_made_the_plans(loss: Any) -> None:
+    """Two steps down a plan's own gradient, in float32 and through other operations, lower the loss."""
+    of, given = loss("airhockey", "float32"), plans("airhockey", 4, torch.float32)
+    log_rate = given["rate"].log().requires_grad_()
+    values = []
+    for _ in range(3):
+        total, _ = plan_loss(of, given["path"], log_rate.exp(), weights=given["weights"], shift=0.5)
+        assert total.dtype == torch.float32
+        values.append(float(total.mean().detach()))
+        (by_rate,) = torch.autograd.grad(total.mean(), [log_rate])
+        log_rate = (log_rate - 1e-2 * by_rate / by_rate.norm()).detach().requires_grad_()
+    assert values[0] > values[1] > values[2]
+
+
+def test_a_second_derivative_is_refused(loss: Any) -> None:
+    of, given = loss("airhockey"), plans("airhockey", 2)
+    path = given.pop("path").requires_grad_()
+    (by_path,) = torch.autograd.grad((plan_loss(of, path, **given)[0] ** 2).sum(), [path], create_graph=True)
+    with pytest.raises(UsageError, match="gradients of gradients of the loss"):
+        by_path.sum().backward()
+    first = torch.func.grad(lambda path: (plan_loss(of, path, **given)[0] ** 2).sum())
+    with pytest.raises(UsageError, match="gradients of gradients of the loss"):
+        torch.func.grad(lambda path: first(path).sum())(path.detach())
+
+
+def test_a_gradient_of_the_weights_alone_is_the_terms(loss: Any) -> None:
+    of, given = loss("airhockey"), plans("airhockey", 3)
+    total, terms = plan_loss(of, **given | {"weights": given["weights"].requires_grad_()})
+    total.sum().backward()
+    torch.testing.assert_close(given["weights"].grad, terms[:, 1:].sum(0))
+
+
+def test_a_plan_that_is_none_touches_no_other_through_autograd(loss: Any) -> None:
+    """A network makes four plans, one of which runs backwards: its weights get the gradient of the other three."""
+    of, given = loss("airhockey", "float32"), plans("airhockey", 4, torch.float32)
+    weights = given["weights"].requires_grad_()
+    network, inputs = torch.nn.Linear(3, 90), torch.eye(4, 3)
+    ways = {
+        "mean": lambda total: total.mean(),
+        "finite": lambda total: total[total.isfinite()].sum() / len(total),
+        "nan_to_num": lambda total: total.nan_to_num().mean(),
+        "where": lambda total: torch.where(total.isfinite(), total, 0).mean(),
+        "log": lambda total: total.log().mean(),
+    }
+
+    def gradients(way: str, rate: Any) -> list[Any]:
+        path = given["path"] + 0.01 * network(inputs).reshape(4, 15, 6)
+        total, _ = plan_loss(of, path[: len(rate)], rate, weights=weights)
+        scale = len(rate) / 4  # means over three and over four
+        return list(torch.autograd.grad(ways[way](total) * scale, [*network.parameters(), weights]))
+
+    for garbage in (-1.0, float("nan"), 1e-35):
+        rate = given["rate"].clone()
+        rate[3, 4] = garbage
+        if garbage > 0:
+            rate[3] = garbage  # the loss overflows
+        for way in ways:
+            expected = gradients("mean" if way != "log" else way, given["rate"][:3])
+            for found, want in zip(gradients(way, rate), expected, strict=True):
+                torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-6)
+
+
+def test_weights_and_heights_may_be_arrays_and_any_float_type_is_taken(loss: Any) -> None:
+    of, given = loss("heavy-object", "float32"), plans("heavy-object", 3, torch.float32)
+    expected = plan_loss(of, **given)[0]
+    arrays = given | {name: given[name].numpy() for name in ("weights", "tops")}
+    for changed in (arrays, given | {"weights": given["weights"].tolist()}):
+        torch.testing.assert_close(plan_loss(of, **changed)[0], expected)
+    for dtype in (torch.bfloat16, torch.float16, torch.float64):
+        path = given["path"].to(dtype).requires_grad_()
+        total, terms = plan_loss(of, **given | {"path": path})
+        assert total.dtype == terms.dtype == torch.float32
+        total.sum().backward()
+        assert path.grad.dtype == dtype
+
+
+def test_it_works_under_autocast(loss: Any) -> None:
+    of, given = loss("airhockey", "float32"), plans("airhockey", 4, torch.float32)
+    network = torch.nn.Linear(3, 20)
+    with torch.autocast("cpu", torch.bfloat16):
+        log_rate = network(torch.ones(4, 3))
+        assert log_rate.dtype == torch.bfloat16
+        total, _ = plan_loss(of, given["path"], log_rate.exp(), weights=given["weights"].requires_grad_())
+        total.mean().backward()
+    assert network.weight.grad.abs().sum() > 0
+    assert given["weights"].grad.dtype == torch.float32
+
+
+def test_functional_gradients_are_the_same(loss: Any) -> None:
+    of, given = loss("airhockey"), plans("airhockey", 3)
+    path = given.pop("path")
+    (expected,) = torch.autograd.grad(plan_loss(of, path.requires_grad_(), **given)[0].sum(), [path])
+    found = torch.func.grad(lambda path: plan_loss(of, path, **given)[0].sum())(path.detach())
+    torch.testing.assert_close(found, expected)
+
+
+def test_without_gradients_only_terms_are_computed(loss: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    of, given = loss("airhockey"), plans("airhockey", 2)
+    monkeypatch.delitem(of.__dict__, "_gradient", raising=False)
+    with torch.no_grad():
+        plan_loss(of, given["path"].requires_grad_(), given["rate"], weights=given["weights"])
+    assert "_gradient" not in of.__dict__
+
+
+MISTAKES = {
+    "rate must have shape (2, 20), got (1, 20)": {"rate": torch.ones(1, 20)},
+    "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
+    "weights must be an array of numbers, got str": {"weights": "abc"},
+    "path must be real numbers, got torch.complex64": {"path": torch.ones(2, 15, 6, dtype=torch.complex64)},
+    "start_tip must have shape (2, 3), got (3,)": {"start_tip": torch.zeros(3)},
+    "shift must be a finite number, got None": {"shift": None},
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_arguments_that_cannot_be_meant_are_named(loss: Any, message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        plan_loss(loss("airhockey"), **plans("airhockey", 2) | MISTAKES[message])
+    assert str(error.value).startswith(message)
+
+
+# Control points.
+
+
+@pytest.fixture(scope="module", params=["airhockey", "heavy-object"])
+def omega(request: pytest.FixtureRequest, cache_folder: Path, fastest: Any) -> Omega:
+    return Omega(request.param, backend=fastest, cache_folder=cache_folder)
+
+
+def test_control_points_meet_the_boundary_conditions_and_have_gradients(omega: Omega) -> None:
+    given = boundary(omega.problem.name, 2)
+    tasks = omega.tasks(given)
+    said = [torch.tensor(part).requires_grad_() for part in outputs(omega, 2)]
+    path, rate = (part.detach() for part in control_points(omega, tasks, *said))
+    wanted = (given.start_q, given.start_dq, given.start_ddq, given.goal_q, given.goal_dq)
+    for found, expected, exact in zip(at_ends(path, rate), wanted, (1e-12, 1e-10, 1e-8) * 2, strict=False):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
+    assert torch.autograd.gradcheck(
+        lambda phi, log_rate: control_points(omega, tasks, phi, log_rate), said, eps=1e-6, rtol=1e-4, atol=1e-6,
+        fast_mode=True,
+    )  # fmt: skip
+
+
+def test_boundary_conditions_may_be_tensors(omega: Omega) -> None:
+    given = boundary(omega.problem.name, 2)
+    tensors = type(given)(*(None if part is None else torch.tensor(part) for part in vars(given).values()))
+    np.testing.assert_array_equal(omega.tasks(tensors).expected_time, omega.tasks(given).expected_time)
+    tensors.goal_q.requires_grad_()
+    with pytest.raises(UsageError, match=r"goal_q must be an array of numbers, got Tensor: .*requires grad"):
+        omega.tasks(tensors)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "expected"), [("bfloat16", "float32"), ("float32", "float32"), ("float64", "float64")]
+)
+def test_control_points_have_at_least_single_precision(omega: Omega, dtype: str, expected: str) -> None:
+    tasks = omega.tasks(boundary(omega.problem.name, 2))
+    said = [torch.tensor(part, dtype=getattr(torch, dtype)).requires_grad_() for part in outputs(omega, 2)]
+    path, rate = control_points(omega, tasks, *said)
+    assert path.dtype == rate.dtype == getattr(torch, expected)
+    path.sum().backward()
+    assert all(part.grad.dtype == part.dtype and part.grad.abs().sum() > 0 for part in said)
+
+
+def test_functional_gradients_of_control_points_are_the_same_and_second_ones_are_refused(omega: Omega) -> None:
+    tasks, (phi, log_rate) = omega.tasks(boundary(omega.problem.name, 2)), map(torch.tensor, outputs(omega, 2))
+
+    def scalar(phi: Any) -> Any:
+        return (control_points(omega, tasks, phi, log_rate)[0] ** 2).sum()
+
+    (expected,) = torch.autograd.grad(scalar(phi.requires_grad_()), [phi])
+    torch.testing.assert_close(torch.func.grad(scalar)(phi.detach()), expected)
+    with pytest.raises(UsageError, match="gradients of gradients"):
+        torch.func.grad(lambda phi: torch.func.grad(scalar)(phi).sum())(phi.detach())
+
+
+def test_a_network_learns_through_control_points_and_loss_although_a_plan_overflows(omega: Omega, loss: Any) -> None:
+    of, tasks = loss(omega.problem.name, "float32"), omega.tasks(boundary(omega.problem.name, 4))
+    torch.manual_seed(0)
+    network = torch.nn.Linear(4, omega.path_outputs + omega.rate_outputs)
+    torch.nn.init.normal_(network.weight, std=1e-2)
+    optimiser, values, overflow = torch.optim.Adam(network.parameters(), 1e-3), [], torch.zeros(4, omega.rate_outputs)
+    overflow[3] = 1000.0
+    for _ in range(5):
+        phi, log_rate = network(torch.eye(4)).split([omega.path_outputs, omega.rate_outputs], dim=1)
+        path, rate = control_points(omega, tasks, phi.tanh(), log_rate + overflow)
+        total, _ = plan_loss(of, path, rate, weights=of.weights0, tops=omega.tops(tasks), start_tip=tasks.start_xyz)
+        assert total.isfinite().tolist() == [True, True, True, False]
+        optimiser.zero_grad()
+        total.mean().backward()
+        optimiser.step()
+        values.append(float(total[:3].mean().detach()))
+    assert values[-1] < values[0]
+    assert all(part.isfinite().all() for part in network.parameters())

@@ -1,0 +1,100 @@
+"""Metrics by the definitions of the paper's tables, and the paper's own rules of what is valid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.examples.plans import course, load
+
+
+@pytest.mark.parametrize("label", ["hit", "replan", "transport", "dragging"])
+def test_metrics_are_those_of_an_independent_integration(label):
+    plan = load(label)
+    metrics, seen, robot = plan.judged().metrics, course(plan, 20001), plan.robot
+    assert metrics.duration == pytest.approx(seen.t[-1], rel=1e-10)
+    assert metrics.duration == pytest.approx(plan.motion.duration()[0], rel=1e-10)
+    assert metrics.effort == pytest.approx(
+        seen.integral(np.sum((seen.tau / robot.torque_limit) ** 2, axis=1)), rel=1e-4
+    )
+    assert metrics.jerk == pytest.approx(np.abs(seen.jerk / (5 * robot.acceleration_limit)).max(), rel=1e-2)
+    if plan.problem.name == "airhockey":
+        assert metrics.z_error == pytest.approx(seen.integral(np.abs(seen.tip[:, 2] - 0.16)), rel=1e-4)
+        speed = np.linalg.norm(seen.tip[-1] - seen.tip[-2]) / (seen.t[-1] - seen.t[-2])
+        assert metrics.hit_speed == pytest.approx(speed, rel=1e-3)
+        assert np.isnan(metrics.vertical_error)
+    else:
+        roll, pitch, _ = Rotation.from_matrix(seen.rotation).as_euler("xyz").T
+        assert metrics.vertical_error == pytest.approx(seen.integral(np.abs(roll) + np.abs(pitch)), rel=1e-4)
+        assert metrics.hit_speed == pytest.approx(0.0, abs=1e-9)
+        assert np.isnan(metrics.z_error)
+
+
+def test_metrics_are_told_in_the_units_of_the_papers_tables():
+    told = load("hit").judged().metrics.to_dict()
+    assert set(told) == {"duration_s", "effort_s", "jerk", "hit_speed_m_s", "z_error_mm_s"}
+    assert told["z_error_mm_s"] == pytest.approx(0.304, abs=1e-3)
+    assert "vertical_error_rad_s" in load("transport").judged().metrics.to_dict()
+
+
+# --- the paper's rules -----------------------------------------------------------------------------------------------
+
+
+def test_a_plan_a_bit_over_the_planning_limits_is_valid_by_the_papers_rules_only():
+    plan = load("hit")
+    robot = plan.robot
+    tight = replace(
+        robot, velocity_limit=0.85 * robot.velocity_limit, acceleration_limit=0.85 * robot.acceleration_limit
+    )
+    verdict = replace(plan, robot=tight).judged()
+    assert not verdict.valid
+    assert verdict.paper.valid
+    tighter = replace(robot, velocity_limit=0.79 * robot.velocity_limit)
+    assert replace(plan, robot=tighter).judged().paper.broken == ("joint velocity limit",)
+
+
+def test_the_nominal_limits_follow_from_the_problems_scales():
+    plan = load("hit")
+    limits = replace(plan.problem.limits, velocity_scale=0.5)
+    half = replace(
+        plan.robot,
+        velocity_limit=0.51 * plan.robot.velocity_limit,
+        acceleration_limit=0.51 * plan.robot.acceleration_limit,
+    )
+    assert replace(plan, robot=half, problem=replace(plan.problem, limits=limits)).judged().paper.valid
+    assert replace(plan, robot=half).judged().paper.broken == ("joint velocity limit", "joint acceleration limit")
+
+
+@pytest.mark.parametrize(("z", "valid"), [(0.169, True), (0.1715, False)])
+def test_the_paper_lets_the_tip_leave_the_table_by_a_centimetre(z, valid):
+    verdict = load("replan").with_constraint("Table", z=z).judged()
+    assert not verdict.valid
+    assert verdict.paper.valid == valid
+    assert verdict.paper.broken == (() if valid else ("off the table",))
+
+
+def test_accelerations_of_a_heavy_object_do_not_count_in_the_paper():
+    plan = load("transport")
+    slow = replace(plan.robot, acceleration_limit=0.1 * plan.robot.acceleration_limit)
+    verdict = replace(plan, robot=slow).judged()
+    assert verdict.reason == "joint acceleration limit"
+    assert verdict.paper.valid
+
+
+def test_the_paper_lets_an_object_enter_by_two_centimetres():
+    verdict = load("dragging").judged()
+    assert not verdict.valid
+    assert verdict.paper.valid
+    plan = load("transport")
+    raised = replace(plan, start_xyz=plan.start_xyz + np.array([0, 0, 0.03]))
+    assert "object in collision" in raised.judged().paper.broken
+
+
+def test_a_plan_that_does_not_end_at_the_goal_is_not_finished():
+    plan = load("transport")
+    away = replace(plan, goal_xyz=plan.goal_xyz + np.array([0.02, 0, 0])).judged()
+    assert not away.paper.finished
+    assert not away.paper.valid
+    assert away.valid  # its joints do what the boundary conditions ask for
+    assert replace(plan, goal_xyz=plan.goal_xyz + np.array([0.005, 0, 0])).judged().paper.finished

@@ -1,0 +1,50 @@
+"""Where the verdict looks: no further apart than the step, densely at the ends, at the right times."""
+
+import numpy as np
+import pytest
+
+from cnpgen.judges.plans.sampling import AT_ENDS, FEWEST, LONGEST, sample, table_phases, time_table
+from cnpgen.trajectory.motion import Motion
+from tests.examples.plans import load
+
+
+@pytest.mark.parametrize("label", ["hit", "replan", "transport"])
+@pytest.mark.parametrize("step", [1e-3, 2e-4, 1.0])
+def test_samples_are_no_further_apart_than_the_step_and_dense_at_the_ends(label, step):
+    motion = load(label).motion
+    samples = sample(time_table(motion.rate[0], 7), step, 13)
+    assert samples is not None
+    assert samples.s[0] == 0
+    assert samples.s[-1] == 1
+    assert np.all(np.diff(samples.s) > 0)
+    exact = motion.time_at(samples.s)[0]
+    np.testing.assert_allclose(samples.t, exact, atol=1e-6)
+    assert np.diff(exact).max() <= step
+    assert len(samples.s) >= FEWEST
+    for near in (samples.s, 1 - samples.s):
+        assert np.sum((near > 0) & (near < 0.0501)) >= AT_ENDS
+        assert np.sum((near > 0) & (near < 2e-3)) >= 10
+
+
+def test_times_are_right_where_the_rate_begins_at_almost_nothing():
+    motion = load("transport").motion
+    rate = motion.rate.copy()
+    rate[:, 0] = 1e-6
+    slow = Motion(motion.path, rate)
+    assert time_table(rate[0], 7)[-1] == pytest.approx(slow.duration()[0], rel=1e-5)
+    assert table_phases()[0] == 0
+    assert table_phases()[-1] == 1
+
+
+def test_a_motion_that_would_take_too_many_samples_is_not_sampled():
+    rate = np.full(20, 1.0 / (1e-3 * LONGEST))
+    assert sample(time_table(0.99 * rate, 7), 1e-3, 13) is None
+    some = sample(time_table(1.01 * rate, 7), 1e-3, 13)
+    assert some is not None
+    assert LONGEST < len(some.s) < 1.1 * LONGEST
+    assert sample(time_table(0.99 * rate, 7), 2e-3, 13) is not None
+
+
+def test_a_coarser_step_takes_fewer_samples():
+    plan = load("transport")
+    assert plan.judged(step=4e-3).samples < plan.judged().samples < plan.judged(step=5e-4).samples

@@ -1,0 +1,714 @@
+"""Kernels: tapes, and the three backends that run them, against each other, against NumPy and against plain Python."""
+
+import itertools
+import math
+import platform
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels import compiled as compiled_module
+from cnpgen.kernels import library as library_module
+from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler, vector_flags
+from cnpgen.kernels.emit import emit
+from cnpgen.kernels.interpreted import BLOCK, InterpretedKernel
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.mapped import MappedKernel
+from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
+from tests.conftest import Prepare, needs_compiler
+
+Array = np.ndarray
+
+UNARY: dict[str, Callable[[ca.SX], ca.SX]] = {
+    "NEG": lambda x: -x,
+    "SQ": lambda x: x * x,
+    "TWICE": lambda x: x + x,
+    "INV": lambda x: 1 / x,
+    "SQRT": ca.sqrt,
+    "FABS": ca.fabs,
+    "SIGN": ca.sign,
+    "NOT": ca.logic_not,
+    "EXP": ca.exp,
+    "SIN": ca.sin,
+    "COS": ca.cos,
+}
+BINARY: dict[str, Callable[[ca.SX, ca.SX], ca.SX]] = {
+    "ADD": lambda a, b: a + b,
+    "SUB": lambda a, b: a - b,
+    "MUL": lambda a, b: a * b,
+    "DIV": lambda a, b: a / b,
+    "FMIN": ca.fmin,
+    "FMAX": ca.fmax,
+    "LT": lambda a, b: a < b,
+    "LE": lambda a, b: a <= b,
+    "EQ": lambda a, b: a == b,
+    "NE": lambda a, b: a != b,
+    "AND": ca.logic_and,
+    "OR": ca.logic_or,
+    "IF_ELSE_ZERO": lambda a, b: ca.if_else(a, b, 0),
+}
+# What the operations are, in the words of IEEE 754 and C: fmin and fmax ignore a nan, a nan is true.
+MEANING: dict[str, Callable[..., Array]] = {
+    "NEG": np.negative, "SQ": np.square, "TWICE": lambda x: 2 * x, "INV": np.reciprocal, "SQRT": np.sqrt,
+    "FABS": np.abs, "SIGN": np.sign, "NOT": lambda x: 1.0 * (x == 0), "EXP": np.exp, "SIN": np.sin, "COS": np.cos,
+    "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "FMIN": np.fmin, "FMAX": np.fmax,
+    "LT": lambda a, b: 1.0 * (a < b), "LE": lambda a, b: 1.0 * (a <= b), "EQ": lambda a, b: 1.0 * (a == b),
+    "NE": lambda a, b: 1.0 * (a != b), "AND": lambda a, b: 1.0 * ((a != 0) & (b != 0)),
+    "OR": lambda a, b: 1.0 * ((a != 0) | (b != 0)), "IF_ELSE_ZERO": lambda a, b: np.where(a != 0, b, 0.0),
+}  # fmt: skip
+SPECIAL = [0.0, -0.0, 1.0, -1.0, 2.5, -2.5, math.inf, -math.inf, math.nan, 1e-3, -7.25, 9e4, 1e-310, 5e-324]
+BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+
+
+def ulps(found: Array, expected: Array) -> Array:
+    """Distance in units in the last place of what is expected; 0 for two nans or two equal infinities."""
+    with np.errstate(invalid="ignore"):
+        same = (found == expected) | (np.isnan(found) & np.isnan(expected))
+        return np.where(same, 0.0, np.abs(found - expected) / np.spacing(np.abs(expected)))
+
+
+def kernel_of(function: ca.Function, backend: str, folder: Path, loop: Loop | None = None) -> Kernel:
+    tape = tape_from_function(function, loop)
+    if backend == "casadi":
+        return MappedKernel(tape, function)
+    return InterpretedKernel(tape) if backend == "numpy" else CompiledKernel(tape, compile_tape(tape, folder))
+
+
+@pytest.fixture(scope="module")
+def operations() -> ca.Function:
+    """Every operation that a tape can hold, applied to the same two numbers."""
+    a, b = ca.SX.sym("a"), ca.SX.sym("b")
+    return ca.Function("operations", [a, b], [f(a) for f in UNARY.values()] + [f(a, b) for f in BINARY.values()])
+
+
+@pytest.fixture(scope="module")
+def operands() -> Array:
+    random = np.random.default_rng(0)
+    special = np.array(list(itertools.product(SPECIAL, SPECIAL))).T
+    numbers = random.normal(size=(2, 2000)) * 10.0 ** random.uniform(-3, 4, (2, 2000))
+    ties = np.repeat(random.normal(size=(1, 50)), 2, axis=0)
+    return np.concatenate([special, numbers, ties, -ties], axis=1)
+
+
+@pytest.fixture(scope="module")
+def evaluated(operations: ca.Function, operands: Array, cache_folder: Path) -> dict[str, dict[str, Array]]:
+    """Backend -> operation -> results."""
+    backends = ["numpy", "casadi", *(["compiled"] if find_compiler() else [])]
+    kernels = {backend: kernel_of(operations, backend, cache_folder) for backend in backends}
+    names = [*UNARY, *BINARY]
+    return {
+        backend: dict(zip(names, [row[0] for row in kernel(operands[:1], operands[1:])], strict=True))
+        for backend, kernel in kernels.items()
+    }
+
+
+def test_all_operations_of_a_tape_are_tested(operations):
+    used = {NAMES[code] for code in tape_from_function(operations).operation}
+    assert used | {"CONST"} == set(NAMES)
+    assert MEANING.keys() == UNARY.keys() | BINARY.keys()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", [*UNARY, *BINARY])
+def test_operation_does_what_ieee_754_says_on_random_and_special_numbers(evaluated, operands, backend, name):
+    with np.errstate(all="ignore"):
+        expected = MEANING[name](*operands[: 1 if name in UNARY else 2])
+    allowed = 2.0 if name in ("SIN", "COS", "EXP") else 0.0
+    wrong = np.flatnonzero(ulps(evaluated[backend][name], expected) > allowed)
+    assert len(wrong) == 0, [(*operands[:, k], evaluated[backend][name][k], expected[k]) for k in wrong[:5]]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_beside_their_zeros(cache_folder, backend):
+    random = np.random.default_rng(1)
+    turns = np.arange(-70_000, 70_000, 7) * (np.pi / 2)
+    beside = np.concatenate([np.nextafter(turns, side) for side in (-np.inf, np.inf)])
+    angles = np.concatenate(
+        [random.uniform(-10, 10, 20_000), random.uniform(-1e5, 1e5, 20_000), turns, beside, 1e5 - np.arange(100.0)]
+    )
+    x = ca.SX.sym("x")
+    kernel = kernel_of(ca.Function("sincos", [x], [ca.sin(x), ca.cos(x)]), backend, cache_folder)
+    sine, cosine = kernel(angles[None])
+    assert ulps(sine[0], np.sin(angles)).max() <= 2
+    assert ulps(cosine[0], np.cos(angles)).max() <= 2
+
+
+@pytest.fixture(scope="module")
+def mixed() -> ca.Function:
+    """Two arguments, two results, constants among them, every lane different."""
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+    first = ca.vertcat(ca.sin(x[0]) * p[1], x[1] / (1 + p[0] ** 2), 2.5, ca.fmax(x[2], p[0]))
+    return ca.Function("mixed", [x, p], [first, ca.if_else(x[0] < p[0], x[1] - x[2], ca.sqrt(x[0] ** 2))])
+
+
+def mixed_in_numpy(x: Array, p: Array) -> list[Array]:
+    first = [np.sin(x[0]) * p[1], x[1] / (1 + p[0] ** 2), np.full(x.shape[1], 2.5), np.maximum(x[2], p[0])]
+    return [np.array(first), np.where(x[0] < p[0], x[1] - x[2], np.abs(x[0]))[None]]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 7, 8, 9, BLOCK + 1])
+def test_batches_of_any_size_are_evaluated_lane_by_lane(mixed, cache_folder, backend, n):
+    kernel = kernel_of(mixed, backend, cache_folder)
+    random = np.random.default_rng(n)
+    x, p = random.normal(size=(3, n)), random.normal(size=(2, n))
+    found, expected = kernel(x, p), mixed_in_numpy(x, p)
+    for result, meant in zip(found, expected, strict=True):
+        assert result.shape == meant.shape
+        np.testing.assert_allclose(result, meant, rtol=1e-15)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_lane_s_bits_do_not_depend_on_the_batch_that_it_is_in(mixed, cache_folder, backend):
+    kernel = kernel_of(mixed, backend, cache_folder)
+    random = np.random.default_rng(2)
+    x, p = random.normal(size=(3, 29)), random.normal(size=(2, 29))
+    whole = kernel(x, p)
+    for first, n in [(0, 1), (3, 2), (28, 1), (5, 7), (9, 17)]:
+        part = kernel(x[:, first : first + n].copy(), p[:, first : first + n].copy())
+        for one, other in zip(part, whole, strict=True):
+            np.testing.assert_array_equal(one, other[:, first : first + n])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_of_arguments_may_be_any_distance_apart(mixed, cache_folder, backend):
+    kernel = kernel_of(mixed, backend, cache_folder)
+    store = np.random.default_rng(3).normal(size=(12, 60))
+    every_other, backwards = store[1:7:2, 11:30], store[5:3:-1, 2:21]
+    one_row = np.broadcast_to(store[7, :19], (2, 19))
+    for x, p in [(every_other, backwards), (every_other, one_row)]:
+        for result, meant in zip(kernel(x, p), mixed_in_numpy(x, p), strict=True):
+            np.testing.assert_allclose(result, meant, rtol=1e-15)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        pytest.param((np.zeros((3, 4)),), id="one missing"),
+        pytest.param((np.zeros((2, 4)), np.zeros((2, 4))), id="wrong width"),
+        pytest.param((np.zeros((3, 4)), np.zeros((2, 5))), id="different numbers of lanes"),
+        pytest.param((np.zeros((3, 4), np.float32), np.zeros((2, 4))), id="float32"),
+        pytest.param((np.zeros((3, 4), ">f8"), np.zeros((2, 4))), id="big endian"),
+        pytest.param((np.zeros((4, 3)).T, np.zeros((2, 4))), id="rows not contiguous"),
+        pytest.param((np.zeros(12), np.zeros((2, 4))), id="one dimension"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(mixed, cache_folder, backend, arguments):
+    with pytest.raises(ValueError, match="mixed"):
+        kernel_of(mixed, backend, cache_folder)(*arguments)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_arguments_are_not_changed(mixed, cache_folder, backend):
+    x, p = np.random.default_rng(4).normal(size=(2, 3, 9))
+    before = x.copy(), p[:2].copy()
+    kernel_of(mixed, backend, cache_folder)(x, p[:2])
+    np.testing.assert_array_equal(x, before[0])
+    np.testing.assert_array_equal(p[:2], before[1])
+
+
+# --- loops ------------------------------------------------------------------------------------------------------------
+
+ROOT = Loop(tolerance=1e-3, limit=12)
+
+
+@pytest.fixture(scope="module")
+def root() -> ca.Function:
+    """Heron's rule for the square root of p; the second state counts the steps."""
+    x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
+    error = ca.fabs(x[0] * x[0] - p)
+    return ca.Function("heron", [x, p], [ca.vertcat(0.5 * (x[0] + p / x[0]), x[1] + 1), error])
+
+
+def heron(x: float, p: float) -> tuple[float, float, float]:
+    """One lane in plain Python."""
+    error, count = math.nan, 0
+    while count < ROOT.limit:
+        error = abs(x * x - p)
+        x, count = 0.5 * (x + p / x), count + 1
+        if error < ROOT.tolerance:
+            break
+    return x, float(count), error
+
+
+def root_lanes(n: int) -> tuple[Array, Array]:
+    random = np.random.default_rng(5)
+    p = 10.0 ** random.uniform(-1, 4, n)
+    p[2::11], p[5::11] = -1.0, math.nan  # these never converge
+    x = random.uniform(0.5, 2.0, n) * np.sqrt(np.abs(np.nan_to_num(p, nan=1.0)))
+    return np.stack([x, np.zeros(n)]), p[None]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_loop_takes_each_lane_to_convergence_and_one_step_further(root, cache_folder, backend):
+    x, p = root_lanes(100)
+    state, error = kernel_of(root, backend, cache_folder, ROOT)(x, p)
+    expected = np.array([heron(*lane) for lane in zip(x[0].tolist(), p[0].tolist(), strict=True)]).T
+    np.testing.assert_array_equal(state[1], expected[1])
+    assert len(set(expected[1])) > 3
+    np.testing.assert_allclose(state[0], expected[0], rtol=1e-12)
+    np.testing.assert_allclose(error[0], expected[2], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_lane_that_does_not_converge_stops_at_the_limit_with_its_error(root, cache_folder, backend):
+    state, error = kernel_of(root, backend, cache_folder, ROOT)(*root_lanes(30))
+    lost = np.flatnonzero(~(error[0] < ROOT.tolerance))
+    assert set(lost) == {k for k in range(30) if k % 11 in (2, 5)}
+    np.testing.assert_array_equal(state[1, lost], ROOT.limit)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("n", [0, 1, 3, 8, 9, 61])
+def test_a_loop_s_lanes_do_not_depend_on_their_neighbours(root, cache_folder, backend, n):
+    kernel = kernel_of(root, backend, cache_folder, ROOT)
+    x, p = root_lanes(61)
+    whole = kernel(x, p)
+    order = np.random.default_rng(6).permutation(61)[:n]
+    shuffled = kernel(x[:, order].copy(), p[:, order].copy())
+    for one, other in zip(shuffled, whole, strict=True):
+        np.testing.assert_array_equal(one, other[:, order])
+
+
+@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+@pytest.mark.parametrize("kind", ["inverse kinematics", "hitting configuration"])
+def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, backend, kind):
+    from cnpgen.pipelines.stages import hitting_newton, ik
+
+    kernels, robot = prepare("airhockey-replan", backend).context.kernels, prepare("airhockey-replan").context.robot
+    random = np.random.default_rng(7)
+    q = random.uniform([-0.6, 0.5, -0.7, -0.7, -0.4, 0.4], [0.6, 1.4, 0.7, -0.4, 0.4, 1.9], (203, 6)).T.copy()
+    p = random.uniform([0.6, -0.45, 0.16], [1.3, 0.45, 0.16], (203, 3)).T.copy()
+    angle = random.uniform(-np.pi, np.pi, 203)
+    if kind == "inverse kinematics":
+        kernel = kernels.load(ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS), vertical=False, max_step=0.4)
+        arguments = [q, p]
+    else:
+        loop = Loop(hitting_newton.TOLERANCE, hitting_newton.MAX_STEPS)
+        kernel = kernels.load(hitting_newton.newton_step, loop)
+        arguments = [q, p, np.stack([np.cos(angle), np.sin(angle)]), np.repeat(robot.base[:, None], 203, axis=1)]
+    whole = kernel(*arguments)
+    for order in (random.permutation(203), np.arange(202, -1, -1), random.permutation(203)[:77]):
+        again = kernel(*(np.ascontiguousarray(x[:, order]) for x in arguments))
+        for one, other in zip(again, whole, strict=True):
+            np.testing.assert_array_equal(one, other[:, order])
+
+
+# --- tapes ------------------------------------------------------------------------------------------------------------
+
+
+def test_tapes_come_back_from_their_bytes_as_they_were(mixed, root):
+    for tape in (tape_from_function(mixed), tape_from_function(root, ROOT)):
+        again = Tape.from_bytes(tape.to_bytes())
+        assert (again.name, again.inputs, again.outputs, again.loop) == (
+            tape.name,
+            tape.inputs,
+            tape.outputs,
+            tape.loop,
+        )
+        for name in ("operation", "a", "b", "constant"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(tape, name))
+            assert getattr(again, name).dtype == getattr(tape, name).dtype
+        assert again.to_bytes() == tape.to_bytes()
+        assert len(again) == len(tape.operation)
+
+
+def test_a_function_that_is_built_twice_gives_the_same_bytes(prepare):
+    from cnpgen.pipelines.stages.ik import ik_step
+
+    robot = prepare("heavy-object").context.robot
+    first, second = (tape_from_function(ik_step(robot, vertical=True, max_step=0.8)).to_bytes() for _ in range(2))
+    assert first == second
+
+
+def test_damaged_tapes_raise_wherever_the_damage_is(root):
+    data = tape_from_function(root, ROOT).to_bytes()
+    for position in range(0, len(data), 37):
+        flipped = bytearray(data)
+        flipped[position] ^= 0x10
+        with pytest.raises(ValueError, match="damaged"):
+            Tape.from_bytes(bytes(flipped))
+        with pytest.raises(ValueError, match="damaged"):
+            Tape.from_bytes(data[:position])
+    with pytest.raises(ValueError, match="damaged"):
+        Tape.from_bytes(data + b"\0")
+
+
+def test_operations_that_tapes_do_not_have_are_refused():
+    x = ca.SX.sym("x")
+    with pytest.raises(ValueError, match="tangent: operation"):
+        tape_from_function(ca.Function("tangent", [x], [ca.tan(x)]))
+
+
+def test_sparse_arguments_and_results_are_refused():
+    x = ca.SX.sym("x", ca.Sparsity.lower(2))
+    with pytest.raises(ValueError, match="argument 0 is sparse"):
+        tape_from_function(ca.Function("lower", [x], [x[0, 0]]))
+    y = ca.SX.sym("y", 2)
+    with pytest.raises(ValueError, match="result 0 is sparse"):
+        tape_from_function(ca.Function("diagonal", [y], [ca.diag(y)]))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_constants_may_be_infinite_or_no_numbers(cache_folder, backend):
+    x = ca.SX.sym("x")
+    constants = [math.inf, -math.inf, math.nan, 0.1, -1e300, 5e-324]
+    kernel = kernel_of(ca.Function("constants", [x], [ca.vertcat(*constants), x]), backend, cache_folder)
+    found, _ = kernel(np.zeros((1, 5)))
+    np.testing.assert_array_equal(found, np.repeat(np.array(constants)[:, None], 5, axis=1))
+
+
+# --- the C that is written --------------------------------------------------------------------------------------------
+
+
+def machine_flags() -> set[str]:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    return set(next((line for line in lines if line.startswith("flags")), "").split())
+
+
+@needs_compiler
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="instruction sets of x86-64")
+@pytest.mark.parametrize(
+    ("march", "needs"), [("x86-64", ""), ("sandybridge", "avx"), ("haswell", "avx2"), ("skylake-avx512", "avx512f")]
+)
+def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
+    prepare: Prepare, tmp_path, monkeypatch, march, needs
+):
+    from cnpgen.pipelines.stages import ik, motion
+
+    monkeypatch.setattr(compiled_module, "vector_flags", lambda: (f"-march={march}",))
+    library = prepare("airhockey-replan").context.kernels
+    reference = replace(library, backend="numpy")
+    random = np.random.default_rng(8)
+    n = 203
+    q = random.uniform([-0.6, 0.5, -0.7, -0.7, -0.4, 0.4], [0.6, 1.4, 0.7, -0.4, 0.4, 1.9], (n, 6)).T.copy()
+    p = random.uniform([0.6, -0.45, 0.16], [1.3, 0.45, 0.16], (n, 3)).T.copy()
+    dq, u = random.uniform(-1, 1, (2, 6, n))
+    cases = [
+        ((ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS)), {"vertical": False, "max_step": 0.4}, [q, p]),
+        ((motion.table_acceleration,), {}, [q, dq, u, random.random((1, n))]),
+    ]
+    for builder, parameters, arguments in cases:
+        expected = reference.load(*builder, **parameters)
+        path = compile_tape(expected.tape, tmp_path)
+        if needs and needs not in machine_flags():
+            continue
+        found = CompiledKernel(expected.tape, path)(*arguments)
+        settled = np.ones(n, bool) if expected.tape.loop is None else found[1][0] < expected.tape.loop.tolerance
+        assert settled.mean() > 0.9
+        np.testing.assert_allclose(
+            found[0][:, settled], expected(*arguments)[0][:, settled], rtol=1e-12, atol=1e-12, err_msg=march
+        )
+
+
+@needs_compiler
+@pytest.mark.skipif(not compiled_module.shutil.which("aarch64-linux-gnu-gcc"), reason="no cross compiler for aarch64")
+def test_the_emitted_c_compiles_for_aarch64(operations, tmp_path):
+    source = tmp_path / "operations.c"
+    source.write_text(emit(tape_from_function(operations)))
+    command = ["aarch64-linux-gnu-gcc", *compiled_module.FLAGS, str(source), "-o", str(tmp_path / "k.so"), "-lm"]
+    subprocess.run(command, check=True)
+
+
+# --- cache ------------------------------------------------------------------------------------------------------------
+
+BUILT: list[str] = []
+
+
+def doubling(*, factor: float = 2.0) -> ca.Function:
+    """A builder that notes that it was called."""
+    BUILT.append("doubling")
+    x = ca.SX.sym("x")
+    return ca.Function("doubling", [x], [factor * x])
+
+
+def library_in(folder: Path, backend: str = "compiled", identity: str = "problem") -> KernelLibrary:
+    return KernelLibrary(backend, folder, identity)  # type: ignore[arg-type]
+
+
+def test_a_tape_is_built_once_per_builder_loop_parameters_and_problem(tmp_path):
+    BUILT.clear()
+    for _ in range(3):
+        library_in(tmp_path, "numpy").load(doubling)
+    assert len(BUILT) == 1
+    library_in(tmp_path, "numpy").load(doubling, factor=3.0)
+    library_in(tmp_path, "numpy").load(doubling, Loop(1e-3, 4))
+    library_in(tmp_path, "numpy", identity="another problem").load(doubling)
+    assert len(BUILT) == 4
+
+
+def test_a_change_anywhere_in_the_package_of_a_plug_in_changes_its_kernels(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "__init__.py").write_text("")
+    (tmp_path / "mine" / "kernels.py").write_text(
+        "import casadi as ca\nfrom mine.helper import FACTOR\n"
+        "def scaled():\n    x = ca.SX.sym('x')\n    return ca.Function('scaled', [x], [FACTOR * x])\n"
+    )
+    use = (
+        "from pathlib import Path; import numpy as np; from mine.kernels import scaled;"
+        "from cnpgen.kernels.library import KernelLibrary;"
+        "print(KernelLibrary('numpy', Path('cache'), 'problem').load(scaled)(np.ones((1, 1)))[0].item())"
+    )
+    for factor in ("2.0", "3.0"):
+        (tmp_path / "mine" / "helper.py").write_text(f"FACTOR = {factor}")
+        command = [sys.executable, "-B", "-c", use]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+        assert done.stdout.strip() == factor
+
+
+def test_a_changed_limit_of_a_problem_changes_its_kernels(prepare: Prepare):
+    pipeline = prepare("airhockey-hit").pipeline
+    problem = pipeline.problem
+    slower = replace(problem, limits=replace(problem.limits, velocity_scale=0.1))
+    block = prepare(replace(pipeline, problem=slower), "numpy").block(1, "train", 0, stop=50)
+    limit = prepare("airhockey-hit").context.robot.rated_velocity * 0.1
+    assert np.all(np.abs(block.columns["goal_dq"]) <= limit[:, None] * (1 + 1e-12))
+
+
+@pytest.mark.parametrize("damage", ["cut off", "empty", "flipped"])
+def test_a_damaged_cached_tape_is_built_again(tmp_path, damage):
+    library_in(tmp_path, "numpy").load(doubling)
+    (path,) = (tmp_path / "tape").iterdir()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes({"cut off": data[: len(data) // 2], "empty": b"", "flipped": data}[damage])
+    BUILT.clear()
+    (result,) = library_in(tmp_path, "numpy").load(doubling)(np.ones((1, 3)))
+    np.testing.assert_array_equal(result, 2.0)
+    assert len(BUILT) == 1
+    library_in(tmp_path, "numpy").load(doubling)
+    assert len(BUILT) == 1
+
+
+DAMAGED_LIBRARY = """
+import sys
+from pathlib import Path
+import numpy as np
+from cnpgen.kernels.compiled import CompiledKernel, compile_tape
+from cnpgen.kernels.tape import Tape
+tape, cache = Tape.from_bytes(Path(sys.argv[1]).read_bytes()), Path(sys.argv[2])
+library = compile_tape(tape, cache)
+whole = library.read_bytes()
+n = len(whole)
+garbage = np.random.default_rng(0).bytes(n)
+zeroed = whole[:4096] + bytes(n - 4096)
+flipped = bytearray(whole)
+flipped[n // 3] ^= 255
+for damage in (b"", whole[:4096], whole[: n - 1], zeroed, flipped, garbage):
+    library.unlink()
+    library.write_bytes(damage)
+    again = compile_tape(tape, cache)
+    assert again.read_bytes() == whole
+    state, error = CompiledKernel(tape, again)(np.ones((2, 3)), np.full((1, 3), 4.0))
+    assert np.allclose(state[0], 2.0)
+print("rebuilt")
+"""
+
+
+@needs_compiler
+def test_a_damaged_library_is_compiled_again_and_does_not_crash_the_interpreter(root, tmp_path):
+    (tmp_path / "tape").write_bytes(tape_from_function(root, ROOT).to_bytes())
+    command = [sys.executable, "-c", DAMAGED_LIBRARY, str(tmp_path / "tape"), str(tmp_path / "cache")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository())
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "rebuilt\n"
+
+
+@needs_compiler
+def test_a_library_without_a_kernel_is_a_machine_error(root, tmp_path):
+    source, library = tmp_path / "empty.c", tmp_path / "empty.so"
+    source.write_text("int nothing;\n")
+    subprocess.run([find_compiler(), "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    with pytest.raises(MachineError, match=r"cannot load the compiled kernel .*empty\.so"):
+        CompiledKernel(tape_from_function(root, ROOT), library)
+
+
+@needs_compiler
+def test_a_library_is_compiled_once_and_by_any_number_of_processes_at_once(root, tmp_path, monkeypatch):
+    tape = tape_from_function(root, ROOT)
+    with ThreadPoolExecutor(3) as pool:
+        paths = set(pool.map(lambda _: compile_tape(tape, tmp_path), range(3)))
+    assert len(paths) == 1
+    assert [path.name for path in (tmp_path / "lib").iterdir()] == [path.name for path in paths]
+    monkeypatch.setattr(compiled_module, "_run_compiler", lambda *_: pytest.fail("compiled again"))
+    assert compile_tape(tape, tmp_path) in paths
+
+
+def repository() -> Path:
+    return Path(__file__).parents[2]
+
+
+WARM_START = """
+import sys
+from cnpgen.kernels.library import choose_backend
+from cnpgen.pipelines.load import load_pipeline
+
+from cnpgen.pipelines.prepared import PreparedPipeline
+backend, folder = choose_backend(sys.argv[1])
+for name in ("airhockey-hit", "airhockey-replan", "heavy-object"):
+    PreparedPipeline(load_pipeline(name), backend=backend, cache_folder=folder).block(0, "train", 0, stop=9)
+print("casadi" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+def test_a_warm_start_does_not_import_casadi(prepare: Prepare, backend):
+    for name in ("airhockey-hit", "airhockey-replan", "heavy-object"):
+        prepare(name, backend)
+    command = [sys.executable, "-c", WARM_START, backend]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=repository())
+    assert done.stdout == "False\n"
+
+
+def test_kernels_of_a_pipeline_restored_from_a_plan_are_those_of_its_files(prepare: Prepare, tmp_path, monkeypatch):
+    from cnpgen.make.load import load_dataset_recipe, restore_dataset_recipe
+    from cnpgen.problems.problem import resolved
+
+    recipe = load_dataset_recipe("airhockey-hit")
+    prepare("airhockey-hit")
+    restored = restore_dataset_recipe(resolved(recipe), recipe.pipeline.problem.urdf_path.read_text(), tmp_path)
+    monkeypatch.setattr(library_module, "tape_from_function", lambda *_: pytest.fail("built again"))
+    prepare(restored.pipeline)
+
+
+# --- choosing a backend -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_compiler: None) -> Path:
+    monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def chosen_with_warnings(wanted: str | None = None) -> tuple[str, Path, list[str]]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        backend, folder = choose_backend(wanted)
+    assert all(warning.category is RuntimeWarning for warning in caught)
+    return backend, folder, [str(warning.message) for warning in caught]
+
+
+@needs_compiler
+def test_the_compiled_backend_is_chosen_without_a_word(own_cache):
+    assert chosen_with_warnings() == ("compiled", own_cache, [])
+    assert chosen_with_warnings("compiled") == ("compiled", own_cache, [])
+
+
+BROKEN = {
+    "fails": ("CC", "/bin/false", "/bin/false does not run"),
+    "makes nothing": ("CC", "/bin/true", "/bin/true failed with exit code 0"),
+    "does not exist": ("CC", "/nowhere/cc", "no C compiler found"),
+    "does not exist, with options": ("CC", "/nowhere/cc -O2", "no C compiler found: CC is '/nowhere/cc -O2'"),
+    "is not quoted right": ("CC", "cc '-O2", "no C compiler found: CC is"),
+    "is not installed": ("PATH", "", "no C compiler found"),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("command", ["'{cc}' -g", "{cc} -DNAME='two words'", "{cc}"])
+def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, tmp_path, command):
+    """Wrappers such as ccache are named so: CC="ccache gcc"."""
+    path = tmp_path / "my compilers" / "cc" if "'{cc}'" in command or command == "{cc}" else tmp_path / "cc"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f'#!/bin/sh\nprintf "%s|" "$@" >> "{tmp_path}/seen"\nexec {find_compiler()} "$@"\n')
+    path.chmod(0o755)
+    compiled_module.find_compiler.cache_clear()
+    monkeypatch.setenv("CC", command.format(cc=path))
+    assert chosen_with_warnings() == ("compiled", own_cache, [])
+    seen = (tmp_path / "seen").read_text()
+    assert {"'{cc}' -g": "-g|", "{cc} -DNAME='two words'": "-DNAME=two words|", "{cc}": "--version|"}[command] in seen
+    assert "-shared|" in seen
+
+
+@needs_compiler
+def test_options_of_the_compiler_are_part_of_what_a_library_is_cached_under(root, own_cache):
+    tape = tape_from_function(root, ROOT)
+    stems = {compiled_module.library_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
+    assert len(stems) == 3
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_without_a_working_compiler_numpy_runs_after_one_warning(own_cache, monkeypatch, what):
+    name, value, text = BROKEN[what]
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv(name, value)
+    backend, _, texts = chosen_with_warnings()
+    assert backend == "numpy"
+    assert len(texts) == 1
+    assert text in texts[0]
+    assert "running on the NumPy backend" in texts[0]
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_without_a_working_compiler_the_compiled_backend_is_a_machine_error(own_cache, monkeypatch, what):
+    name, value, text = BROKEN[what]
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv(name, value)
+    with pytest.raises(MachineError, match=text):
+        choose_backend("compiled")
+
+
+@needs_compiler
+def test_a_compiler_that_makes_wrong_code_is_found_out(own_cache, monkeypatch):
+    monkeypatch.setattr(library_module, "CompiledKernel", lambda tape, _path: lambda x: [x])
+    with pytest.raises(MachineError, match="wrong code"):
+        choose_backend("compiled")
+
+
+def test_a_tape_that_cannot_be_cached_is_used_nevertheless(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    (result,) = library_in(tmp_path / "file", "numpy").load(doubling)(np.ones((1, 3)))
+    np.testing.assert_array_equal(result, 2.0)
+
+
+def test_a_full_disk_leaves_no_half_of_a_tape(tmp_path, monkeypatch):
+    def full(*_arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    (result,) = library_in(tmp_path, "numpy").load(doubling)(np.ones((1, 3)))
+    np.testing.assert_array_equal(result, 2.0)
+    assert list((tmp_path / "tape").iterdir()) == []
+
+
+def test_a_cached_tape_may_be_read_by_whom_the_umask_allows(tmp_path):
+    """A cache that a group shares: temporary files, which only their owner may read, are not what is kept."""
+    library_in(tmp_path, "numpy").load(doubling)
+    (path,) = (tmp_path / "tape").iterdir()
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_backends_that_do_not_exist_are_named(own_cache):
+    with pytest.raises(UsageError, match="'cuda' does not exist: expected one of compiled, numpy, casadi"):
+        choose_backend("cuda")
+
+
+@pytest.mark.parametrize("wanted", ["numpy", "casadi"])
+def test_the_other_backends_need_no_compiler(own_cache, monkeypatch, wanted):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    assert chosen_with_warnings(wanted) == (wanted, own_cache, [])
+
+
+@needs_compiler
+def test_the_vector_flags_let_the_compiler_use_this_machine(tmp_path):
+    assert vector_flags()[0] in ("-march=native", "-mcpu=native")
+
+
+def test_the_selftest_tape_is_the_one_that_casadi_would_make():
+    x = ca.SX.sym("x")
+    tape = tape_from_function(ca.Function("twice", [x], [x + x]))
+    assert tape.operation.tolist() == [CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]]

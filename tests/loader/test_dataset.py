@@ -1,0 +1,236 @@
+"""Opening a dataset for training: what is in it, its rows at random, and what is refused."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.loader import shards as shards_module
+from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.gather import RowError
+from cnpgen.loader.load import load_dataset
+from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.reader import open_dataset
+from cnpgen.store.shard import read_placements
+from tests.examples.loader import ALL, columns, ids, make
+from tests.examples.store import PLAN, make_shard
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("loader") / "set")
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> Dataset:
+    return load_dataset(folder)
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    """A dataset to be damaged."""
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def test_a_dataset_says_what_is_in_it(dataset: Dataset, folder: Path) -> None:
+    assert dataset.splits == {"train": 50, "validation": 10}
+    assert list(dataset) == ["train", "validation"]
+    assert len(dataset) == 2
+    assert "train" in dataset
+    assert "test" not in dataset
+    assert dataset.fields["start_q"].unit == "rad"
+    assert dataset.fields["start_q"].names == ("j1", "j2", "j3")
+    assert list(dataset.fields) == list(ALL)
+    assert dataset.fingerprint == open_dataset(folder).manifest["fingerprint"]  # type: ignore[index]
+    assert repr(dataset) == f"<two-shards 1.0.0 in {folder}: 50 train, 10 validation>"
+
+
+def test_load_dataset_is_a_public_name() -> None:
+    assert cnpgen.load_dataset is load_dataset
+
+
+def test_arrays_are_all_rows_as_they_are_stored(dataset: Dataset) -> None:
+    found = dataset.arrays("train", fields=dataset.fields)
+    for name, values in columns().items():
+        assert np.array_equal(found[name], values)
+        assert found[name].dtype == values.dtype
+        assert found[name].flags.c_contiguous
+    assert list(dataset.arrays()) == ["start_q", "goal_p"]  # no diagnostics, no integers
+
+
+def test_arrays_are_normalised_and_converted_when_asked_for(dataset: Dataset) -> None:
+    raw = dataset.arrays("validation", fields=ALL)
+    found = dataset.arrays("validation", fields=ALL, normalize=True, dtype="float32")
+    train = columns()
+    assert found["start_q"].dtype == np.float32
+    expected = (raw["start_q"] - train["start_q"].mean(0)) / train["start_q"].std(0)
+    assert np.allclose(found["start_q"], expected, rtol=0, atol=1e-6)
+    assert np.array_equal(found["sample_id"], raw["sample_id"])
+
+
+@pytest.mark.parametrize("indices", [[0], [49, 0, 31, 32, 33, 5, 5], [-1, -50, 3], np.arange(50)[::-7], []])
+def test_rows_come_in_the_order_they_are_asked_for(dataset: Dataset, indices: list[int]) -> None:
+    found = dataset.rows("train", indices, fields=ALL)
+    for name, values in columns().items():
+        assert np.array_equal(found[name], values[np.array(indices, int)])
+
+
+def test_a_split_is_a_sequence_of_rows(dataset: Dataset) -> None:
+    split, rows = dataset["train"], columns()
+    assert len(split) == 50
+    assert np.array_equal(split[3]["start_q"], rows["start_q"][3])
+    assert np.array_equal(split[np.int64(-1)]["goal_p"], rows["goal_p"][-1])
+    assert np.array_equal(split[30:40:3]["goal_p"], rows["goal_p"][30:40:3])
+    assert np.array_equal(split[[40, 2]]["start_q"], rows["start_q"][[40, 2]])
+    assert split[3]["start_q"].shape == (3,)
+    assert split[60:]["start_q"].shape == (0, 3)
+    assert [row["start_q"][0] for row in split] == rows["start_q"][:, 0].tolist()
+
+
+@pytest.mark.parametrize("row", [50, -51, [3, 50]])
+def test_a_row_that_does_not_exist_is_an_index_error_and_one_of_ours(dataset: Dataset, row: int | list[int]) -> None:
+    with pytest.raises(RowError, match=r"split 'train' has 50 rows, there is no row (50|-51)"):
+        dataset["train"][row]
+    assert issubclass(RowError, IndexError)
+    assert issubclass(RowError, cnpgen.CnpgenError)
+
+
+@pytest.mark.parametrize("indices", [[0.5], [[1, 2]], np.ones(50, bool), ["a"]])
+def test_indices_that_are_not_integers_are_refused(dataset: Dataset, indices: list[float]) -> None:
+    with pytest.raises(UsageError, match="rows must be a list of integers"):
+        dataset.rows("train", indices)
+
+
+def test_few_shards_stay_mapped_however_many_are_visited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shards_module, "MOST_MAPS", 3)
+    dataset = load_dataset(make(tmp_path, shard_size=4))
+    rows = columns(shard_size=4)["start_q"]
+    for row in np.random.default_rng(0).integers(50, size=60):
+        assert np.array_equal(dataset["train"][row]["start_q"], rows[row])
+    assert len(dataset.reader._maps) == 3
+
+
+def test_the_real_thing_is_loaded(tiny) -> None:
+    dataset = cnpgen.load_dataset(tiny("airhockey-hit"))
+    batches = dataset.batches(200)
+    tables = np.concatenate([batch.table for batch in batches])
+    assert tables.shape == (600, sum(part.stop - part.start for part in next(iter(batches)).columns.values()))
+    assert np.isfinite(tables).all()
+    assert np.abs(tables.mean(0)).max() < 1e-5
+    constant = np.ptp(tables, axis=0) == 0
+    assert (tables[:, constant] == 0).all()
+    assert np.abs(tables[:, ~constant].std(0) - 1).max() < 1e-5
+
+
+# What is not whole is refused.
+
+
+def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None:
+    save_plan(tmp_path, PLAN)
+    make_shard(tmp_path, PLAN, shards(PLAN)[1])
+    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards"):
+        load_dataset(tmp_path)
+    dataset = load_dataset(tmp_path, allow_incomplete=True)
+    assert dataset.splits == {"train": 18, "validation": 0}
+    assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [list(range(32, 50))]
+    assert dataset["train"][0]["start_q"].tolist() == columns()["start_q"][32].tolist()
+    rows = columns()["start_q"][32:]
+    assert np.allclose(dataset.normalization.mean["start_q"], rows.mean(0), rtol=0, atol=1e-15)  # type: ignore[union-attr]
+    with pytest.raises(UsageError, match="more than the 0 rows"):
+        dataset.batches(1, split="validation")
+    assert list(dataset.batches(1, split="validation", drop_last=False)) == []
+    assert dataset.arrays("validation")["start_q"].shape == (0, 3)
+
+
+def test_a_dataset_without_training_rows_cannot_be_normalised_by_itself(dataset: Dataset, tmp_path: Path) -> None:
+    lonely = load_dataset(make(tmp_path, splits={"test": 9}))
+    with pytest.raises(DatasetError, match="no training rows to normalise with; pass normalize=False"):
+        lonely.batches(3, split="test")
+    raw = np.concatenate([b["start_q"] for b in lonely.batches(3, split="test", normalize=False, shuffle=False)])
+    borrowed = lonely.batches(3, split="test", normalize=dataset.normalization, shuffle=False)
+    expected = (raw - columns()["start_q"].mean(0)) / columns()["start_q"].std(0)
+    assert np.allclose(np.concatenate([batch["start_q"] for batch in borrowed]), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("option", ["allow_incomplete", "verify"])
+def test_options_are_yes_or_no(tmp_path: Path, option: str) -> None:
+    with pytest.raises(UsageError, match=f"{option} must be True or False, got 'no'"):
+        load_dataset(make(tmp_path), **{option: "no"})  # type: ignore[arg-type]
+
+
+def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"plan\.json is missing"):
+        load_dataset(tmp_path)
+    with pytest.raises(UsageError, match="nowhere is not there, expected the folder of a dataset"):
+        load_dataset(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut off"])
+def test_a_shard_that_is_not_whole_is_noticed_when_the_dataset_is_opened(copy: Path, damage: str) -> None:
+    path = copy / "train" / "shard-00000.h5"
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DatasetError, match=r"is damaged: .*shard-00000\.h5 (is missing|has \d+ bytes instead of)"):
+        load_dataset(copy)
+    dataset = load_dataset(copy, allow_incomplete=True)
+    assert dataset.splits == {"train": 18, "validation": 10}
+    assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [list(range(32, 50))]
+    assert dataset.fingerprint != load_dataset(copy, allow_incomplete=True).blueprint.fingerprint
+
+
+def test_a_changed_byte_among_the_numbers_is_noticed_when_the_shard_is_read(copy: Path) -> None:
+    path = copy / "train" / "shard-00001.h5"
+    content = bytearray(path.read_bytes())
+    content[(read_placements(path)["start_q"].offset or 0) + 3] ^= 1
+    path.write_bytes(content)
+    dataset = load_dataset(copy)
+    with pytest.raises(DatasetError, match=r"shard-00001\.h5 is damaged: its sha256 is not the recorded one"):
+        list(dataset.batches(10))
+    with pytest.raises(DatasetError, match="sha256"):
+        dataset["train"][-1]
+    assert len(dataset["train"][:32]["start_q"]) == 32  # the other shard is as good as it was
+    assert len(list(load_dataset(copy, verify=False).batches(10))) == 5
+
+
+@pytest.mark.parametrize("verify", [True, False])
+def test_a_shard_in_the_place_of_another_is_noticed(copy: Path, tmp_path: Path, verify: bool) -> None:
+    other = make(tmp_path / "other", splits={"train": 64})
+    shutil.copy(other / "train" / "shard-00000.h5", copy / "train" / "shard-00000.h5")
+    dataset = load_dataset(copy, verify=verify)
+    with pytest.raises(DatasetError, match="sha256" if verify else "of another dataset or another place"):
+        dataset["train"][0]
+
+
+def test_a_shard_that_vanishes_while_it_is_in_use_is_an_error_and_not_a_hang(copy: Path) -> None:
+    dataset = load_dataset(copy)
+    (copy / "train" / "shard-00001.h5").unlink()
+    with pytest.raises(DatasetError, match=r"shard-00001\.h5 is missing; run the same make-dataset command again"):
+        list(dataset.batches(10))
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "stats.json", "plan.json"])
+def test_a_damaged_document_is_refused(copy: Path, name: str) -> None:
+    text = (copy / name).read_text()
+    (copy / name).write_text(text.replace("0", "1", 1))
+    with pytest.raises(DatasetError, match=name):
+        load_dataset(copy)
+
+
+def test_statistics_of_another_plan_are_refused(copy: Path, tmp_path: Path) -> None:
+    other = make(tmp_path / "other", seed=3)
+    shutil.copy(other / "stats.json", copy / "stats.json")
+    with pytest.raises(DatasetError, match=r"stats\.json is of another plan"):
+        load_dataset(copy)
+
+
+def test_another_dataset_has_another_fingerprint(dataset: Dataset, tmp_path: Path) -> None:
+    again = load_dataset(make(tmp_path / "again"))
+    other = load_dataset(make(tmp_path / "other", seed=3))
+    assert dataset.fingerprint == again.fingerprint != other.fingerprint
+    assert replace(PLAN, seed=3).fingerprint == other.blueprint.fingerprint

@@ -1,0 +1,119 @@
+"""Reading shards: mapped where possible, read where not, checked once."""
+
+import mmap
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.errors import DatasetError
+from cnpgen.loader import shards as shards_module
+from cnpgen.loader.load import load_dataset
+from cnpgen.loader.shards import Shard, ShardReader
+from tests.examples.loader import columns, make
+from tests.examples.store import FIELDS
+
+
+@pytest.fixture
+def shard(tmp_path: Path) -> Shard:
+    return load_dataset(make(tmp_path / "set")).shards["train"][0]
+
+
+ROWS = {name: values[:32] for name, values in columns().items()}
+
+
+def rewritten(shard: Shard, **options: Any) -> Shard:
+    """Write a shard's fields anew, as another program might, with other layout or types."""
+    with h5py.File(shard.path) as file:
+        attributes, content = dict(file.attrs), {name: file[name][()] for name in file}
+    with h5py.File(shard.path, "w") as file:
+        file.attrs.update(attributes)
+        for name, values in content.items():
+            dtype = values.dtype.newbyteorder(">") if options.get("swapped") else values.dtype
+            extra = {"chunks": True, "compression": "gzip"} if options.get("compressed") else {}
+            file.create_dataset(name, data=values.astype(dtype), **extra)
+    return replace(shard, size=shard.path.stat().st_size)
+
+
+def test_fields_are_mapped_into_memory_and_cannot_be_written_to(shard: Shard) -> None:
+    found = ShardReader(verify=True).read(shard, FIELDS)
+    for name, values in ROWS.items():
+        assert np.array_equal(found[name], values)
+        assert isinstance(found[name].base, mmap.mmap)
+        assert not found[name].flags.writeable
+
+
+@pytest.mark.parametrize("options", [{"swapped": True}, {"compressed": True}, {"compressed": True, "swapped": True}])
+def test_what_cannot_be_mapped_is_read(shard: Shard, options: dict[str, bool]) -> None:
+    found = ShardReader(verify=False).read(rewritten(shard, **options), FIELDS)
+    for name, values in ROWS.items():
+        assert not isinstance(found[name].base, mmap.mmap)
+        assert np.array_equal(found[name], values)
+
+
+def test_a_file_system_without_memory_maps_is_read(shard: Shard, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_arguments: Any, **_options: Any) -> None:
+        raise OSError(19, "No such device")
+
+    monkeypatch.setattr(shards_module.mmap, "mmap", refuse)
+    found = ShardReader(verify=True).read(shard, FIELDS)
+    assert all(np.array_equal(found[name], values) for name, values in ROWS.items())
+
+
+def test_batches_of_shards_that_cannot_be_mapped_are_the_same(tmp_path: Path) -> None:
+    dataset = load_dataset(make(tmp_path / "set"), verify=False)
+    expected = [batch.table for batch in dataset.batches(10)]
+    changed = {
+        split: tuple(rewritten(s, compressed=True, swapped=True) for s in part)
+        for split, part in dataset.shards.items()
+    }
+    found = [batch.table for batch in replace(dataset, shards=changed, reader=ShardReader(verify=False)).batches(10)]
+    assert np.array_equal(found, expected)
+
+
+def test_as_many_maps_are_kept_as_may_be_and_no_newer_one_is_thrown_out(tmp_path: Path) -> None:
+    dataset, most = load_dataset(make(tmp_path / "set", splits={"train": 40}, shard_size=1)), shards_module.MOST_MAPS
+    shards = dataset.shards["train"]
+    assert len(shards) > most
+    for count, shard in enumerate(shards, 1):
+        dataset.reader.read(shard, FIELDS)
+        assert len(dataset.reader._maps) == min(count, most)
+    assert list(dataset.reader._maps) == [shard.path for shard in shards[-most:]]
+
+
+def test_a_shard_is_checked_once(shard: Shard, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = []
+    original = shards_module.file_sha256
+    monkeypatch.setattr(shards_module, "file_sha256", lambda path: counted.append(path) or original(path))
+    reader = ShardReader(verify=True)
+    for _ in range(3):
+        reader.read(shard, FIELDS)
+    pickle.loads(pickle.dumps(reader)).read(shard, FIELDS)
+    assert counted == [shard.path]
+    ShardReader(verify=False).read(shard, FIELDS)
+    assert counted == [shard.path]
+
+
+def test_a_shard_that_is_cut_off_after_it_was_checked_is_an_error_and_no_crash(shard: Shard) -> None:
+    reader = ShardReader(verify=True)
+    reader.read(shard, FIELDS)
+    shard.path.write_bytes(shard.path.read_bytes()[:100])
+    with pytest.raises(DatasetError, match=r"has 100 bytes instead of \d+; run the same make-dataset command again"):
+        reader.read(shard, FIELDS)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 4}, r"field 'start_q' is float64 of shape \(32, 3\); the plan says float of shape \(32, 4\)"),
+        ({"dtype": "int64"}, r"is float64 of shape \(32, 3\); the plan says int64"),
+        ({"name": "end_q"}, "field 'end_q' is missing"),
+    ],
+)
+def test_a_shard_that_is_not_what_the_plan_says_is_refused(shard: Shard, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        ShardReader(verify=True).read(shard, [replace(FIELDS[0], **change)])

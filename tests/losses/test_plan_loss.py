@@ -1,0 +1,342 @@
+"""The loss: values against Pinocchio, Coal and SciPy, backends, margins and funnels, and what it refuses."""
+
+import copy
+import pickle
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import CnpgenError
+from cnpgen.losses.margins import Margins
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.losses.quadrature import quadrature
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.problem import Problem
+from cnpgen.schema.keys import field
+from cnpgen.trajectory.motion import Motion
+from tests.conftest import needs_compiler
+from tests.examples.losses import PROBLEM_OF, Batch, batch, huber, loss, states, step_losses
+from tests.examples.plans import PROBLEMS
+
+PROBLEM_NAMES = ("airhockey", "heavy-object")
+LABEL_OF = {"airhockey": "hit", "heavy-object": "transport"}
+
+
+def beside(label: str, count: int = 3) -> Batch:
+    """Plans that break every constraint, but enter no obstacle with the robot: Coal knows no depth of a segment."""
+    given = batch(label, count, by=0.02 if label == "transport" else 0.1, raised=0.03)
+    return replace(given, rate=given.rate * 1.5)
+
+
+@pytest.mark.parametrize("label", ["hit", "replan", "transport"])
+@pytest.mark.parametrize(("rule", "shift"), [("cosine", 0.0), ("cosine", 0.3), ("gauss", 0.0)])
+def test_terms_are_the_quadrature_of_what_pinocchio_and_coal_measure(label, rule, shift):
+    of, given = loss(PROBLEM_OF[label], rule=rule, nodes=24), beside(label)
+    found = given.evaluated(of, shift=shift).terms
+    s, weights = quadrature(rule, 24, shift)
+    for k in range(len(found)):
+        at = states(given.path[k], given.rate[k], s)
+        expected = (weights / at.rate) @ step_losses(given.problem, at, given.tops[k])
+        exact = np.array([name != "object-contact" for name in of.terms])  # a bound where the object is tilted
+        np.testing.assert_allclose(found[k][exact], expected[exact], rtol=1e-9, atol=1e-14)
+
+
+def test_a_nearly_upright_object_in_a_pedestal_costs_what_coal_measures():
+    of, upright = loss("heavy-object", nodes=24), batch("transport", 1, by=0.0, raised=-0.02)
+    given = replace(upright, tops=upright.tops + 0.03)  # 1 cm into the object at both ends
+    s, weights = quadrature("cosine", 24)
+    at = states(given.path[0], given.rate[0], s)
+    expected = (weights / at.rate) @ step_losses(given.problem, at, given.tops[0])
+    assert expected[-1] > 1e-6
+    assert given.evaluated(of).terms[0, -1] == pytest.approx(expected[-1], rel=0.02)  # upright to a milliradian
+
+
+@pytest.mark.parametrize("name", PROBLEM_NAMES)
+def test_every_term_counts_in_the_plans_that_the_values_are_compared_on(name):
+    terms = beside(LABEL_OF[name]).evaluated(loss(name)).terms
+    silent = {loss(name).terms[k] for k in np.flatnonzero((terms == 0).all(axis=0))}
+    assert silent <= {"joint-position"}  # whose value is compared in the next test
+
+
+def test_joint_positions_beyond_their_limits_cost_what_the_paper_says():
+    of, given = loss("airhockey", nodes=16), batch("hit", 2, by=1.5)
+    s, weights = quadrature("cosine", 16)
+    for k, found in enumerate(given.evaluated(of).terms[:, of.terms.index("joint-position")]):
+        at, robot = states(given.path[k], given.rate[k], s), of._robot
+        beyond = np.maximum(robot.position_lower - at.q, 0) + np.maximum(at.q - robot.position_upper, 0)
+        assert found == pytest.approx((weights / at.rate) @ huber(beyond).sum(axis=1), rel=1e-10)
+        assert found > 0
+
+
+@pytest.mark.parametrize("name", PROBLEM_NAMES)
+def test_the_total_is_the_task_loss_and_the_weighted_terms(name):
+    of, given = loss(name), batch(LABEL_OF[name], 3)
+    weights = np.random.default_rng(0).uniform(0, 10, len(of.terms) - 1)
+    value = given.evaluated(of, weights=weights)
+    np.testing.assert_allclose(value.total, value.terms[:, 0] + value.terms[:, 1:] @ weights, rtol=1e-13)
+    assert of.terms[0] == "time"
+    assert len(of.terms) == value.terms.shape[1] == 1 + len(PROBLEMS[name].constraint)
+    assert of.budgets.shape == of.weights0.shape == weights.shape
+
+
+def test_budgets_and_first_weights_are_those_of_the_problem_file():
+    of, constraints = loss("airhockey"), PROBLEMS["airhockey"].constraint
+    assert of.terms[1:] == ("joint-position", "joint-velocity", "joint-acceleration", "joint-torque", "table")
+    assert of.budgets.tolist() == [constraint.budget for constraint in constraints]
+    assert of.weights0.tolist() == [constraint.weight for constraint in constraints]
+
+
+@pytest.mark.parametrize("name", PROBLEM_NAMES)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_without_a_compiler_the_loss_is_the_same_up_to_rounding(name, dtype):
+    given = batch(LABEL_OF[name], 5)
+    kinds = ["numpy", "casadi"] if dtype == "float64" else ["numpy"]
+    reference = given.evaluated(loss(name, dtype=dtype))
+    for backend in kinds:
+        value = given.evaluated(loss(name, dtype=dtype, backend=backend))
+        tolerance = 1e-10 if dtype == "float64" else 2e-4
+        for field_name in ("total", "terms", "path_gradient", "rate_gradient"):
+            found, expected = getattr(value, field_name), getattr(reference, field_name)
+            assert found.dtype == expected.dtype == dtype
+            np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 15, 16, 17, 127, 128, 129, 300])
+def test_a_plan_s_loss_does_not_depend_on_the_batch_that_it_is_in(n):
+    of, few = loss("airhockey", dtype="float32"), batch("hit", 7)
+    rows = np.arange(n) % 7
+    value, alone = few[rows].evaluated(of), few.evaluated(of)
+    assert value.path_gradient.shape == (n, 15, 6)
+    assert value.rate_gradient.shape == (n, 20)
+    np.testing.assert_allclose(value.terms, alone.terms[rows], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(value.path_gradient, alone.path_gradient[rows], rtol=1e-4, atol=1e-3)
+
+
+def test_any_layout_and_type_of_arrays_is_taken():
+    of, given = loss("airhockey"), batch("hit", 20)
+    expected = given.evaluated(of)
+    lanes_last = np.ascontiguousarray(given.path.transpose(1, 2, 0)).transpose(2, 0, 1)
+    for path in (lanes_last, np.asfortranarray(given.path), given.path.tolist(), given.path[::-1][::-1]):
+        np.testing.assert_allclose(replace(given, path=path).evaluated(of).total, expected.total, rtol=1e-13)
+
+
+def test_without_a_gradient_the_terms_are_the_same_and_the_gradients_are_of_no_plan():
+    of, given = loss("heavy-object"), batch("transport", 3)
+    value = given.evaluated(of, gradient=False)
+    np.testing.assert_allclose(value.terms, given.evaluated(of).terms, rtol=1e-12)
+    assert value.path_gradient.shape == (0, 15, 7)
+    assert value.rate_gradient.shape == (0, 20)
+
+
+# --- what is no plan --------------------------------------------------------------------------------------------------
+
+GARBAGE = {
+    "path is nan": ("path", (4, 2), np.nan),
+    "path is infinite": ("path", (0, 0), -np.inf),
+    "path overflows float32": ("path", (3, 1), 1e300),
+    "rate is nan": ("rate", (19,), np.nan),
+    "rate is zero": ("rate", (5,), 0.0),
+    "rate is negative": ("rate", (0,), -1.0),
+    "height is nan": ("tops", (0,), np.nan),
+}
+
+
+@pytest.mark.parametrize("what", GARBAGE)
+@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+def test_what_is_no_plan_costs_nan_and_touches_no_other(what, backend):
+    of, given = loss("heavy-object", dtype="float32", backend=backend), batch("transport", 5)
+    expected = given.evaluated(of)
+    name, index, value = GARBAGE[what]
+    array = getattr(given, name).copy()
+    array[(2, *index)] = value
+    found = replace(given, **{name: array}).evaluated(of)
+    others = np.arange(5) != 2
+    for part in ("total", "terms", "path_gradient", "rate_gradient"):
+        assert np.isnan(getattr(found, part)[2]).all()
+        np.testing.assert_array_equal(getattr(found, part)[others], getattr(expected, part)[others])
+
+
+def test_a_control_point_of_the_rate_below_zero_makes_no_plan_even_where_the_motion_runs_forward():
+    of, given = loss("airhockey"), batch("hit", 2)
+    given.rate[1, 9] = -0.01
+    assert Motion(given.path, given.rate, 7).runs_forward().all()
+    assert np.isnan(given.evaluated(of).total).tolist() == [False, True]
+
+
+def test_control_points_metres_away_cost_much_and_stay_finite():
+    of, given = loss("airhockey", dtype="float32"), batch("hit", 2)
+    value = replace(given, path=given.path * 1e3).evaluated(of)
+    assert np.isfinite(value.total).all()
+    assert (value.total > 1e3).all()
+
+
+MISTAKES = {
+    "path must have shape (N, 15, 6), got (3, 15, 7)": {"path": np.zeros((3, 15, 7))},
+    "path must have shape (N, 15, 6), got (15, 6)": {"path": np.zeros((15, 6))},
+    "rate must have shape (3, 20), got (2, 20)": {"rate": np.ones((2, 20))},
+    "rate must be an array of numbers, got str": {"rate": "fast"},
+    "tops must have shape (3, 0), got (3, 2)": {"tops": np.zeros((3, 2))},
+    "start_tip must have shape (3, 3), got (3,)": {"start_tip": np.zeros(3)},
+    "rate must be an array of numbers, got ndarray: complex128 is no real type": {"rate": np.ones((3, 20)) * 1j},
+    "weights must be an array of numbers, got str": {"weights": "abc"},
+    "weights must have shape (5,) for joint-position": {"weights": np.ones(6)},
+    "the weight of 'joint-torque' must be a number that is not negative, got -1.0": {"weights": [1, 1, 1, -1, 1]},
+    "the weight of 'table' must be a number that is not negative, got nan": {"weights": [1, 1, 1, 1, np.nan]},
+    "the shift of the quadrature nodes must be in [0, 1), got 1.5": {"shift": 1.5},
+    "shift must be a finite number, got None": {"shift": None},
+    "gradient must be True or False, got 'no'": {"gradient": "no"},
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_arguments_that_cannot_be_meant_are_named(message):
+    given = batch("hit", 3)
+    arguments = {"path": given.path, "rate": given.rate, "weights": np.ones(5), "tops": None, **MISTAKES[message]}
+    with pytest.raises(CnpgenError) as error:
+        loss("airhockey")(**arguments)
+    assert str(error.value).startswith(message)
+
+
+def test_missing_heights_of_obstacles_are_an_error():
+    given = batch("transport", 1)
+    with pytest.raises(CnpgenError, match="tops is missing: the problem 'heavy-object' has obstacles"):
+        loss("heavy-object")(given.path, given.rate, weights=np.ones(7))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dtype": "float16"}, "dtype must be one of float64, float32, got 'float16'"),
+        ({"form": "sined"}, r"form must be one of signed, paper, got 'sined' \(did you mean 'signed'"),
+        ({"rule": "uniform"}, "between uniform nodes the ends of r hide violations"),
+        ({"nodes": 0}, "the number of quadrature nodes must be an integer from 1 on, got 0"),
+        ({"nodes": 64.5}, "the number of quadrature nodes must be an integer from 1 on, got 64.5"),
+        ({"nodes": "64"}, "the number of quadrature nodes must be an integer from 1 on, got '64'"),
+        ({"rule": 3}, "quadrature rule 3 does not exist"),
+        ({"margins": {"table": 1e-3}}, "margins must be a Margins or None, got {'table': 0.001}"),
+        ({"backend": "cuda"}, "backend 'cuda' does not exist"),
+        ({"margins": Margins({"joint-velocty": 0.9})}, r"no such term.*did you mean 'joint-velocity'"),
+        ({"margins": Margins({"joint-velocity": 98.5})}, "above 0 and at most 1, got 98.5"),
+        ({"margins": Margins({}, {"table": np.inf})}, "an inset must be a finite number, got inf"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_named(options, message):
+    with pytest.raises(CnpgenError, match=message):
+        PlanLoss(PROBLEMS["airhockey"], **options)
+
+
+def test_a_problem_may_be_named_and_nothing_else_is_one():
+    assert PlanLoss("airhockey").terms == loss("airhockey").terms
+    with pytest.raises(CnpgenError, match="did you mean 'airhockey'"):
+        PlanLoss("airhokey")
+    with pytest.raises(CnpgenError, match=r"problem must be the name of a problem, .* got None"):
+        PlanLoss(None)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda of: pickle.loads(pickle.dumps(of))])
+def test_a_loss_that_was_used_can_be_copied_and_sent_to_other_processes(copied):
+    of, given = PlanLoss("airhockey", nodes=8), batch("hit", 2)
+    tips = np.array([[0.65, 0.0, 0.19]] * 2)
+    expected = [given.evaluated(of, start_tip=tips, gradient=gradient) for gradient in (True, False)]
+    again = copied(of)
+    for gradient, value in zip((True, False), expected, strict=True):
+        np.testing.assert_array_equal(given.evaluated(again, start_tip=tips, gradient=gradient).terms, value.terms)
+
+
+# --- margins, funnels, other constraints ------------------------------------------------------------------------------
+
+
+def test_margins_cost_what_the_same_limits_in_the_problem_file_would():
+    problem, given = PROBLEMS["airhockey"], beside("hit")
+    tighter = replace(
+        problem,
+        limits=replace(problem.limits, velocity_scale=0.8 * 0.9, acceleration_cap=18.0),
+        constraint=tuple(
+            replace(each, x=replace(each.x, low=0.62, high=1.98), y=replace(each.y, low=-0.43, high=0.43))
+            if hasattr(each, "x")
+            else each
+            for each in problem.constraint
+        ),
+    )
+    margins = Margins({"joint-velocity": 0.9, "joint-acceleration": 0.9}, {"table": 0.02})
+    found = given.evaluated(PlanLoss(problem, dtype="float64", margins=margins))
+    expected = given.evaluated(PlanLoss(tighter, dtype="float64", backend="numpy"))
+    np.testing.assert_allclose(found.terms, expected.terms, rtol=1e-9)
+    np.testing.assert_allclose(found.path_gradient, expected.path_gradient, rtol=1e-7, atol=1e-6)
+    assert (found.terms[:, [2, 3, 5]] > given.evaluated(loss("airhockey")).terms[:, [2, 3, 5]]).all()
+
+
+@pytest.mark.parametrize(("start", "allowed"), [(0.163, 0.003), (0.19, 0.005)], ids=["in the band", "beyond it"])
+def test_a_motion_that_starts_off_the_table_is_given_the_funnel_s_way_to_it(start: float, allowed: float):
+    of, given = loss("airhockey", nodes=32), batch("hit", 2, by=0.1)
+    table, column = PROBLEMS["airhockey"].constraint[-1], -1
+    tips = np.array([[0.65, 0.0, start], [0.65, 0.0, 0.16]])
+    found = given.evaluated(of, start_tip=tips).terms
+    at_once = given.evaluated(of).terms
+    np.testing.assert_allclose(found[1], at_once[1], rtol=1e-13)
+    s, weights = quadrature("cosine", 32)
+    at = states(given.path[0], given.rate[0], s)
+    band = allowed * np.clip((0.3 - s) / 0.2, 0, 1)
+    height = np.array([_tip(of, q)[2] for q in at.q])
+    saved = huber(height - table.z) - huber(np.maximum(np.abs(height - table.z) - band, 0))
+    assert at_once[0, column] - found[0, column] == pytest.approx((weights / at.rate) @ saved, rel=1e-9)
+    np.testing.assert_allclose(found[0, :column], at_once[0, :column], rtol=1e-13)
+
+
+def _tip(of: PlanLoss, q: np.ndarray) -> np.ndarray:
+    import pinocchio as pin
+
+    model = of._robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return np.array(data.oMf[model.getFrameId(of._robot.tip)].translation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeepOut(Constraint):
+    """The tip stays out of a circle: a plug-in that says nothing about training."""
+
+    reason = "in the circle"
+    radius: float = field("radius", unit="m", low=0.0)
+    tolerance: float = field("how deep a motion may enter and still be called valid", unit="m", low=0.0)
+
+    def symbolic(self, state: Any) -> tuple[Condition, ...]:
+        return self._outside(state.kinematics.tip)
+
+    def measured(self, world: Any) -> tuple[Condition, ...]:
+        return self._outside(world.tip_position)
+
+    def _outside(self, tip: Any) -> tuple[Condition, ...]:
+        distance = ((tip[0] - 0.9) ** 2 + tip[1] ** 2) ** 0.5
+        return (Condition("circle", "m", [distance], np.array([self.radius]), np.array([np.inf]), "position"),)
+
+
+def plugged_in(radius: float, monkeypatch: pytest.MonkeyPatch) -> Problem:
+    from cnpgen.schema import registry
+
+    original = registry.name_of
+    monkeypatch.setattr(
+        registry, "name_of", lambda group, kind: "keep-out" if kind is KeepOut else original(group, kind)
+    )
+    problem = PROBLEMS["airhockey"]
+    two = (KeepOut(radius=radius, tolerance=1e-3, budget=1e-4, weight=2.0), KeepOut(radius=0.1, tolerance=1e-3))
+    return replace(problem, constraint=(*problem.constraint[:2], *two))
+
+
+def test_a_constraint_that_says_nothing_about_training_is_a_term_with_a_gradient(monkeypatch):
+    of, given = PlanLoss(plugged_in(0.5, monkeypatch), dtype="float64", nodes=24, backend="numpy"), batch("hit", 2)
+    assert of.terms == ("time", "joint-position", "joint-velocity", "keep-out", "keep-out-2")
+    assert (of.budgets[2], of.weights0[2]) == (1e-4, 2.0)
+    weights = np.array([0.0, 0.0, 5.0, 0.0])
+    value = of(given.path, given.rate, weights=weights)
+    s, quadrature_weights = quadrature("cosine", 24)
+    at = states(given.path[0], given.rate[0], s)
+    tips = np.array([_tip(of, q) for q in at.q])
+    inside = np.maximum(0.5 - np.hypot(tips[:, 0] - 0.9, tips[:, 1]), 0)
+    assert value.terms[0, 3] == pytest.approx((quadrature_weights / at.rate) @ huber(inside), rel=1e-9)
+    direction = np.random.default_rng(1).normal(size=given.path.shape)
+    ends = [of(given.path + h * direction, given.rate, weights=weights, gradient=False).total for h in (1e-6, -1e-6)]
+    expected = (ends[0] - ends[1]) / 2e-6
+    np.testing.assert_allclose(np.einsum("kcn,kcn->k", value.path_gradient, direction), expected, rtol=1e-6)

@@ -1,0 +1,221 @@
+"""Sharing work out: results in any order or in theirs, workers that end with their parent, and other backends."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import joblib
+import pytest
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.machine.workers import _signals_held, share_out, worker_count
+from tests.examples.tiny_datasets import digests, make_tiny
+
+ROOT = Path(__file__).parents[2]
+linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
+
+
+def slowest_first(number: int) -> int:
+    time.sleep(0.05 * (3 - number))
+    return number
+
+
+def test_there_are_no_more_workers_than_tasks():
+    assert worker_count(8, 3) == 3
+    assert worker_count(2, 300) == 2
+    assert worker_count(5, 0) == 1
+    assert 1 <= worker_count(None, 1000) <= (os.cpu_count() or 1)
+    with pytest.raises(UsageError, match="workers must be an integer from 1 on, got 0"):
+        worker_count(0, 3)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("ordered", [False, True])
+def test_every_task_is_done_and_results_come_in_their_order_if_asked(workers, ordered):
+    found = list(share_out(slowest_first, range(3), workers, ordered=ordered))
+    assert found == [0, 1, 2] if ordered or workers == 1 else sorted(found) == [0, 1, 2]
+
+
+def test_tasks_are_fetched_as_they_are_needed():
+    fetched = []
+
+    def tasks():
+        for number in range(1000):
+            fetched.append(number)
+            yield 3
+
+    results = share_out(slowest_first, tasks(), 2)
+    next(results)
+    results.close()
+    assert len(fetched) < 50
+
+
+KILLED = """
+import os, signal, sys, time
+from cnpgen.machine.workers import share_out
+
+if __name__ == "__main__":
+    for _ in share_out(time.sleep, [0.0, 0.0, 60.0, 60.0], 2):
+        if sys.stdin.readline().strip() == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@linux
+def test_what_a_killed_process_leaves_is_tidied_up_without_a_word():
+    options, pipe = list(sys.warnoptions), subprocess.PIPE
+    command = [sys.executable, "-c", KILLED]
+    with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        said = process.communicate("go on\ndie\n", timeout=60)  # until the helpers are gone, too
+    assert (process.returncode, *said) == (-signal.SIGKILL, "", "")
+    assert not [path for path in Path("/dev/shm").iterdir() if f"loky-{process.pid}-" in path.name]
+    assert sys.warnoptions == options
+
+
+def fail(_task: int) -> None:
+    raise ZeroDivisionError("on purpose")
+
+
+def test_an_error_of_a_task_is_that_error():
+    with pytest.raises(ZeroDivisionError, match="on purpose"):
+        list(share_out(fail, range(4), 2))
+
+
+def die(_task: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_dead_worker_is_a_machine_error_with_advice():
+    with pytest.raises(MachineError, match=r"^a worker died \(killed, or out of memory\): try again$"):
+        list(share_out(die, range(4), 2, advice=": try again"))
+
+
+# --- signals ----------------------------------------------------------------------------------------------------------
+
+
+def blocked(_task: int) -> set[int]:
+    return {int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, ())}
+
+
+def test_workers_never_see_the_interruption_that_a_terminal_sends_to_all():
+    assert not blocked(0)
+    for found in share_out(blocked, range(4), 2):
+        assert {signal.SIGINT, signal.SIGTERM} <= found
+    assert not blocked(0)
+
+
+def test_a_signal_that_comes_while_workers_start_is_only_delayed():
+    started, over = [], threading.Event()
+
+    def interrupted() -> None:
+        with _signals_held():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            started.append(True)
+
+    other = threading.Thread(target=over.wait)  # blocks no signal
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+    finally:
+        over.set()
+        other.join()
+    assert started == [True]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+CHILD = """
+import os, sys, time
+from cnpgen.machine.workers import share_out
+def pid(number):
+    time.sleep(number)
+    return os.getpid()
+if __name__ == "__main__":
+    for found in share_out(pid, [0.2, 0.2, 100, 100], 2):
+        print(found, flush=True)
+"""
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@linux
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, number):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        pytest.skip("the tests run under nohup, and so do those that they start")
+    (tmp_path / "child.py").write_text(CHILD)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    command = [sys.executable, str(tmp_path / "child.py")]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        workers = {int(child.stdout.readline()) for _ in range(2)}
+        assert all(map(alive, workers))
+        child.send_signal(number)
+        assert child.wait(10) == -number
+        deadline = time.monotonic() + 10
+        while any(map(alive, workers)) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not any(map(alive, workers))
+        assert "Traceback" not in child.stderr.read()
+
+
+# --- other backends ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["threading", "sequential"])
+def test_backends_without_processes_make_the_same_bytes(tiny, tmp_path, backend):
+    with joblib.parallel_config(backend=backend):
+        make_tiny(tmp_path / "out", workers=4, shard_size=250)
+    assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
+
+
+def test_a_backend_that_cannot_yield_results_is_refused_before_anything_is_made(tmp_path):
+    match = "MultiprocessingBackend cannot yield results one by one: choose loky"
+    with joblib.parallel_config(backend="multiprocessing"), pytest.raises(UsageError, match=match):
+        make_tiny(tmp_path / "out", workers=2)
+    assert not digests(tmp_path / "out")
+
+
+@pytest.fixture
+def cluster():
+    """Dask's scheduler and two workers, each a process."""
+    distributed = pytest.importorskip("distributed")
+    local = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with local as cluster, distributed.Client(cluster) as client:
+        yield client
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")  # of dask's own
+def test_dask_makes_the_same_bytes(tiny, tmp_path, cluster):
+    with joblib.parallel_config(backend="dask"):
+        made = make_tiny(tmp_path / "out", workers=2)
+    assert made.complete
+    assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
+
+
+def die_once(marker: Path, task: int) -> int:
+    try:
+        marker.touch(exist_ok=False)
+    except FileExistsError:
+        return task
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+def test_dask_gives_the_task_of_a_dead_worker_to_another(tmp_path, cluster):
+    with joblib.parallel_config(backend="dask"):
+        assert sorted(share_out(partial(die_once, tmp_path / "died"), range(6), 2)) == list(range(6))
+    assert (tmp_path / "died").exists()

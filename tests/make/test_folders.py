@@ -1,0 +1,294 @@
+"""The folder of a dataset: what is somebody else's is never touched, what costs nothing gives way."""
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.cli.main import main
+from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
+from cnpgen.make.dataset import make_dataset
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.store.blueprint import load_blueprint
+from cnpgen.validate.dataset import validate_dataset
+from tests.conftest import TINY_SHARD, tiny_recipe
+from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
+
+
+@pytest.fixture
+def folder(tiny: Callable[[str], Path], tmp_path: Path) -> Path:
+    """A copy of a finished dataset."""
+    return Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "out"))
+
+
+CHANGES = {
+    "seed": {"seed": 1},
+    "dtype": {"dtype": "float32"},
+    "backend": {"backend": "numpy"},
+    "shard_size": {"shard_size": 100},
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_another_dataset_in_the_folder_is_refused_and_not_touched(folder, what):
+    if CHANGES[what] == {"backend": load_blueprint(folder).backend}:
+        pytest.skip("this is the only backend here")
+    before = snapshot(folder)
+    words = what.replace("_", " ")
+    with pytest.raises(UsageError, match=f"holds another dataset .*{words} .* instead of .*--force"):
+        make_tiny(folder, **CHANGES[what])
+    assert snapshot(folder) == before
+
+
+def test_another_recipe_in_the_folder_is_refused_and_not_touched(folder):
+    before = snapshot(folder)
+    with pytest.raises(UsageError, match=r"holds another dataset \(name airhockey-hit instead of heavy-object"):
+        make_tiny(folder, "heavy-object")
+    changed = tiny_recipe("airhockey-hit")
+    stages = changed.pipeline.stage
+    changed = replace(changed, pipeline=replace(changed.pipeline, stage=(*stages, stages[-1])))
+    with pytest.raises(UsageError, match=r"holds another dataset \(another recipe\); choose"):
+        make_dataset(changed, folder, workers=1, shard_size=TINY_SHARD)
+    assert snapshot(folder) == before
+
+
+def test_a_corrected_title_is_the_same_dataset(folder):
+    before = snapshot(folder)
+    changed = tiny_recipe("airhockey-hit")
+    problem = replace(changed.pipeline.problem, title="other words")
+    changed = replace(changed, pipeline=replace(changed.pipeline, title="corrected", problem=problem))
+    made = make_dataset(changed, folder, workers=1)
+    assert (made.made, made.complete) == (0, True)
+    assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize("rows", [1320, 330])
+def test_another_size_is_refused_with_what_can_be_done(folder, rows):
+    before = snapshot(folder)
+    with pytest.raises(UsageError) as caught:
+        make_dataset(tiny_recipe("airhockey-hit"), folder, n=rows, workers=1)
+    text = str(caught.value)
+    assert "holds this dataset with 660 rows (train 600, validation 60), not with" in text
+    assert f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
+    assert "the rows that both sizes have are the same: choose another --out, or replace it with --force" in text
+    assert snapshot(folder) == before
+
+
+def test_force_replaces_another_dataset(folder):
+    made = make_tiny(folder, "airhockey-replan", force=True, shard_size=400)
+    assert made.complete
+    assert validate_dataset(folder).ok
+    assert sorted(digests(folder)) == ["train/shard-00000.h5", "train/shard-00001.h5", "validation/shard-00000.h5"]
+
+
+# --- plans of which nothing was made ----------------------------------------------------------------------------------
+
+
+def hopeless(monkeypatch) -> None:
+    """Let no draw be accepted."""
+    run = PreparedPipeline._round
+
+    def rejected(self, random, size):
+        batch = run(self, random, size)
+        batch.stage = "test"
+        batch.reject(np.zeros(len(batch.alive), bool), "hopeless")
+        return batch
+
+    monkeypatch.setattr(PreparedPipeline, "_round", rejected)
+
+
+def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_corrected_one(tmp_path, monkeypatch):
+    hopeless(monkeypatch)
+    with pytest.raises(RecipeError, match=r"0 of .* draws were accepted"):
+        make_tiny(tmp_path / "out", seed=1, shard_size=77)
+    monkeypatch.undo()
+    assert (tmp_path / "out" / "plan.json").is_file()
+    assert make_tiny(tmp_path / "out", seed=2).complete
+    assert load_blueprint(tmp_path / "out").seed == 2
+    assert validate_dataset(tmp_path / "out").ok
+
+
+@pytest.mark.parametrize("content", ["cut", "flipped"])
+def test_a_damaged_plan_of_which_nothing_was_made_gives_way(tmp_path, content):
+    folder = tmp_path / "out"
+    make_tiny(folder, part=(0, 9))
+    assert not digests(folder)
+    path = folder / "plan.json"
+    if content == "cut":
+        path.write_bytes(path.read_bytes()[:200])
+    else:
+        flip(path)
+    assert make_tiny(folder).complete
+    assert validate_dataset(folder).ok
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"garbage", None])
+def test_a_damaged_plan_with_rows_is_refused_until_it_is_forced(folder, content):
+    if content is None:
+        flip(folder / "plan.json")
+    else:
+        (folder / "plan.json").write_bytes(content)
+    before = snapshot(folder)
+    with pytest.raises(DatasetError, match=r"plan.json is damaged: .*; --force replaces the whole dataset"):
+        make_tiny(folder)
+    assert snapshot(folder) == before
+    assert make_tiny(folder, force=True).complete
+    assert validate_dataset(folder).ok
+
+
+def test_force_works_where_the_plan_is_damaged_and_a_record_or_all_documents_are_lost(folder):
+    (folder / "plan.json").write_bytes(b"")
+    for name in ("manifest.json", "stats.json", "README.md", "croissant.json", "validation/shard-00000.json"):
+        (folder / name).unlink()
+    assert make_tiny(folder, force=True).complete
+    assert validate_dataset(folder).ok
+
+
+def test_force_works_where_the_plan_is_lost(folder):
+    (folder / "plan.json").unlink()
+    with pytest.raises(DatasetError, match=r"plan.json is missing; --force replaces the whole dataset"):
+        make_tiny(folder)
+    assert make_tiny(folder, force=True).complete
+    assert validate_dataset(folder).ok
+
+
+# --- what is somebody else's ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("plan", [None, "", "{}", '{"terraform": 1}'])
+def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force, plan):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    (tmp_path / "README.md").write_text("mine")
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "shard-00000.h5").write_text("somebody else's")
+    (tmp_path / "train" / "shard-00000.json").write_text('{"weights": 3}')
+    if plan is not None:
+        (tmp_path / "plan.json").write_text(plan)
+    before = snapshot(tmp_path)
+    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another --out"):
+        make_tiny(tmp_path, force=force)
+    assert snapshot(tmp_path) == before
+
+
+def test_no_detour_hides_what_is_in_a_folder(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "README.md").write_text("mine")
+    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen"):
+        make_tiny(tmp_path / "missing" / ".." / "mine")
+    assert snapshot(tmp_path) == {"mine/README.md": b"mine"}
+
+
+@pytest.mark.parametrize("name", ["train/notes.txt", "thesis.tex", "train/shard-1.h5", "train/shard-00000.h5.bak"])
+def test_force_does_not_delete_a_dataset_with_foreign_files(folder, name):
+    (folder / name).write_text("mine")
+    before = snapshot(folder)
+    with pytest.raises(UsageError, match=f"{name}, which is not part of the dataset"):
+        make_tiny(folder, seed=3, force=True)
+    assert snapshot(folder) == before
+
+
+def test_force_does_not_follow_a_link_out_of_the_folder(folder, tmp_path):
+    shutil.move(folder / "train", tmp_path / "precious")
+    (folder / "train").symlink_to(tmp_path / "precious")
+    with pytest.raises(UsageError, match="train, which is not part of the dataset"):
+        make_tiny(folder, seed=3, force=True)
+    assert len(list((tmp_path / "precious").iterdir())) == 6
+
+
+def test_a_deletion_that_is_cut_off_leaves_what_force_can_delete(folder, monkeypatch):
+    unlink, calls = Path.unlink, []
+
+    def refuse(self: Path, missing_ok: bool = False) -> None:
+        calls.append(self)
+        if len(calls) == 4:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        unlink(self, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(MachineError, match=r"cannot delete from .*: Input/output error"):
+        make_tiny(folder, seed=3, force=True)
+    monkeypatch.undo()
+    assert not (folder / "manifest.json").exists()
+    assert make_tiny(folder, seed=3, force=True).complete
+    assert validate_dataset(folder).ok
+
+
+# --- places where nothing can be made ---------------------------------------------------------------------------------
+
+
+def refused(capsys, out: str) -> tuple[int, str]:
+    """Try to make a dataset in a place; return the exit code and the only line."""
+    code = main(["make-dataset", "airhockey-hit", "--n", "100", "--workers", "1", "--quiet", "--out", out])
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    assert said.out == ""
+    assert line.startswith("cnpgen: error: ")
+    return code, line
+
+
+def test_a_place_where_no_folder_can_be_is_one_line_with_what_to_do(tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    expected = {
+        "": (2, "out must name a folder, got ''"),
+        str(tmp_path / "file"): (2, "file is a file, not a folder; choose another --out"),
+        str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another --out"),
+        str(tmp_path / ("x" * 300)): (3, "File name too long; choose a shorter name"),
+    }
+    for out, (code, text) in expected.items():
+        found, line = refused(capsys, out)
+        assert (found, text in line) == (code, True), line
+    assert (tmp_path / "file").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_a_place_that_the_system_does_not_give_is_a_machine_error(capsys):
+    code, line = refused(capsys, "/proc/x")
+    assert code == 3
+    assert "cannot " in line
+    assert "/proc/x: " in line
+    assert "; choose " in line
+
+
+def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)  # root may write everywhere
+    monkeypatch.setattr("cnpgen.make.dataset.draw_up", None)
+    code, line = refused(capsys, str(tmp_path / "new"))
+    assert code == 3
+    assert line.endswith("new: Permission denied; choose a folder that you may write to")
+    assert not list(tmp_path.iterdir())
+
+
+WRONG = {
+    "n": ({"n": 0}, "n must be an integer from 1 to 1000000000000, got 0"),
+    "negative n": ({"n": -5}, "n must be an integer from 1 to 1000000000000, got -5"),
+    "seed": ({"seed": -1}, "seed must be an integer from 0 to 9223372036854775807, got -1"),
+    "shard size": ({"shard_size": 0}, "shard_size must be an integer from 1 on, got 0"),
+    "dtype": ({"dtype": "float16"}, "dtype must be 'float64' or 'float32', got 'float16'"),
+    "backend": ({"backend": "cuda"}, "backend 'cuda' does not exist"),
+    "workers": ({"workers": 0}, "workers must be an integer from 1 on, got 0"),
+    "part beyond the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2|--force would delete"),
+    "part of nothing": ({"part": (0, 0)}, "part must be K/M|--force would delete"),
+}
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("what", WRONG)
+def test_arguments_that_make_no_sense_are_refused_before_anything_is_touched(folder, what, force):
+    before = snapshot(folder)
+    options, text = WRONG[what]
+    with pytest.raises(UsageError, match=text):
+        make_tiny(folder, force=force, **options)
+    assert snapshot(folder) == before
+
+
+def test_a_recipe_that_does_not_exist_is_a_recipe_error(tmp_path):
+    with pytest.raises(RecipeError, match="airhockey-replan"):
+        make_dataset("airhockey-replay", tmp_path / "out")
+    assert not (tmp_path / "out").exists()

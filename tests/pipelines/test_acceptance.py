@@ -1,0 +1,153 @@
+"""The last gate: rows that meet every constraint pass, rows with one wrong number do not, and the reason says which."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from cnpgen.pipelines.acceptance import _unmet, acceptance
+from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
+from cnpgen.pipelines.stages.stage import Round
+from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages
+
+BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+STATES = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")]
+
+
+def judged(prepared: PreparedPipeline, batch: Round, **changes: np.ndarray) -> Round:
+    """Copy the survivors, change some columns and pass them through the gate."""
+    again = Round(len(batch.alive))
+    for name, values in batch.columns.items():
+        again[name] = changes.get(name, values).copy()
+    acceptance(prepared.context, set(batch.columns))(again, random_generator(0, "train", 0))
+    return again
+
+
+def fates(batch: Round) -> set[str]:
+    return {batch.reasons[k - 1] for k in set(batch.fate.tolist()) if k}
+
+
+def roomy(prepared: PreparedPipeline, batch: Round) -> Round:
+    """Keep what is not on the verge of breaking a constraint already: one small change is to break one constraint."""
+    robot = prepared.context.robot
+    for end in ("start", "goal"):
+        room = np.minimum(batch[f"{end}_q"].T - robot.position_lower, robot.position_upper - batch[f"{end}_q"].T)
+        batch.reject(room.min(1) > 1e-3, "on a joint limit")
+        if f"{end}_clearance" in batch.columns:
+            batch.reject(batch[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
+    return batch
+
+
+@pytest.fixture(scope="module")
+def rounds(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, Round]]:
+    return {name: (prepare(name), roomy(prepare(name), run_stages(prepare(name), 250, seed=111))) for name in SHIPPED}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", SHIPPED)
+def test_what_the_stages_made_passes(prepare: Prepare, rounds, name, backend):
+    _, batch = rounds[name]
+    again = judged(prepare(name, backend), batch)
+    assert len(again.alive) == again.size > 40
+    reasons = [constraint.reason for constraint in prepare(name).context.problem.constraint]
+    extra = ["hit not along its direction"] if name.startswith("airhockey") else []
+    assert again.reasons == [*reasons, "tip not at its position", *extra]
+
+
+# pipeline, column, row of the column, what is added, and the reason
+WRONG = [
+    ("airhockey-replan", "start_q", 1, 1e-5, "off the table"),
+    ("airhockey-replan", "goal_q", 3, 1e-5, "off the table"),
+    ("airhockey-replan", "start_q", 0, 1e-6, "vertical or misplaced"),
+    ("airhockey-replan", "start_q", 0, 10.0, "joint position limit"),
+    ("airhockey-replan", "goal_q", 5, -10.0, "joint position limit"),
+    ("airhockey-replan", "start_dq", 2, 5.0, "joint velocity limit"),
+    ("airhockey-replan", "goal_dq", 2, -5.0, "joint velocity limit"),
+    ("airhockey-replan", "start_dq", 1, 1e-8, "off the table"),
+    ("airhockey-replan", "start_ddq", 0, 50.0, "joint acceleration limit"),
+    ("airhockey-replan", "start_ddq", 1, 1e-7, "off the table"),
+    ("airhockey-replan", "start_xyz", 0, 1e-7, "tip not at its position"),
+    ("airhockey-replan", "goal_xyz", 1, -1e-7, "tip not at its position"),
+    ("airhockey-replan", "hit_angle", 0, 1e-6, "hit not along its direction"),
+    ("airhockey-replan", "hit_speed", 0, 1e-7, "hit not along its direction"),
+    ("airhockey-replan", "hit_speed", 0, -1e-7, "hit not along its direction"),
+    ("airhockey-hit", "start_dq", 1, 1e-8, "off the table"),
+    ("airhockey-hit", "hit_angle", 0, -1e-6, "hit not along its direction"),
+    ("heavy-object", "start_q", 5, 1e-6, "not vertical"),
+    ("heavy-object", "goal_q", 5, -1e-6, "not vertical"),
+    ("heavy-object", "start_q", 0, 1e-6, "tip not at its position"),
+    ("heavy-object", "goal_dq", 6, 10.0, "joint velocity limit"),
+    ("heavy-object", "start_ddq", 0, 1000.0, "joint acceleration limit"),
+    ("heavy-object", "start_xyz", 2, 0.02, "robot in collision"),
+    ("heavy-object", "start_xyz", 2, 0.005, "object in collision"),
+    ("heavy-object", "goal_xyz", 2, 0.005, "object in collision"),
+    ("heavy-object", "goal_xyz", 2, 0.0005, "tip not at its position"),
+]
+
+
+@pytest.mark.parametrize(("name", "column", "row", "amount", "reason"), WRONG)
+def test_one_wrong_number_is_rejected_under_its_constraint(rounds, name, column, row, amount, reason):
+    prepared, batch = rounds[name]
+    changed = batch[column].copy()
+    changed[row] += amount
+    again = judged(prepared, batch, **{column: changed})
+    assert len(again.alive) == 0
+    expected = {"off the table", "tip not at its position"} if reason == "vertical or misplaced" else {reason}
+    assert fates(again) <= expected | {"joint torque limit"} if column == "start_ddq" else fates(again) <= expected
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_none_is_never_accepted_wherever_it_is(prepare: Prepare, rounds, name, backend, value):
+    _, batch = rounds[name]
+    columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in batch.columns]
+    places = [(column, row) for column in columns for row in range(len(batch[column]))]
+    assert len(places) <= len(batch.alive)
+    changes = {column: batch[column].copy() for column in columns}
+    for draw, (column, row) in enumerate(places):
+        changes[column][row, draw] = value
+    again = judged(prepare(name, backend), batch, **changes)
+    accepted = [places[draw] for draw in again.alive.tolist() if draw < len(places)]
+    assert accepted == []
+    assert len(again.alive) == again.size - len(places)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (-1.0, np.inf), (-1.0, 1.0)])
+def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
+    x = ca.SX.sym("x")
+    unmet = ca.Function("unmet", [x], [_unmet([x], np.array([lower]), np.array([upper]), np.array([0.5]))])
+    assert [float(unmet(value)) for value in (0.0, 1.4, -1.4)] == [0.0, 0.0, 0.0]
+    assert float(unmet(np.nan)) > 0
+    assert [float(unmet(value)) > 0 for value in (1.6, -1.6)] == [bool(upper < 1.6), bool(lower > -1.6)]
+
+
+def test_torques_beyond_their_limits_are_rejected(prepare: Prepare, rounds):
+    for name in ("airhockey-replan", "heavy-object"):
+        prepared, batch = rounds[name]
+        limits = replace(prepared.context.problem.limits, torque_scale=0.01)
+        weak = prepare(replace(prepared.pipeline, problem=replace(prepared.context.problem, limits=limits)), "numpy")
+        again = judged(weak, batch)
+        assert len(again.alive) < 0.1 * again.size
+        assert fates(again) == {"joint torque limit"}
+
+
+def test_reasons_are_given_in_the_order_of_the_problem_s_constraints(rounds):
+    """A row that breaks two constraints is counted once, under the first."""
+    prepared, batch = rounds["airhockey-replan"]
+    q, dq = batch["start_q"] + 10.0, batch["start_dq"] + 10.0
+    assert fates(judged(prepared, batch, start_q=q, start_dq=dq)) == {"joint position limit"}
+    assert fates(judged(prepared, batch, start_dq=dq)) == {"joint velocity limit"}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_float32_rows_are_judged_as_they_are_stored(prepare: Prepare, name):
+    block = prepare(name, dtype="float32").block(5, "train", 0, stop=300)
+    for field, values in block.columns.items():
+        if field not in ("attempts", "sample_id"):
+            np.testing.assert_array_equal(values, values.astype(np.float32).astype(np.float64))
+    robot = prepare(name).context.robot
+    for end in ("start", "goal"):
+        assert np.all(np.abs(block.columns[f"{end}_dq"]) <= robot.velocity_limit[:, None])
+        assert np.all(block.columns[f"{end}_q"] <= robot.position_upper[:, None])

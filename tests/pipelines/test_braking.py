@@ -1,0 +1,203 @@
+"""Full braking: the roll-out against one by Pinocchio whose every step HiGHS solves, and the stage in a pipeline."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from cnpgen.kernels.tape import Loop
+from cnpgen.make.load import find_recipe
+from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
+from cnpgen.pipelines.stages.braking import MAX_STEPS, STEP, SUSPECT, BrakingReach, braking_step, overshoot, tip_state
+from cnpgen.pipelines.stages.stage import Round
+from cnpgen.problems.constraints.table import Table
+from tests.conftest import Arm, Prepare, needs_compiler, run_stages, without_stages
+
+Array = np.ndarray
+BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+DRAWS = 1500
+EDGES = [(0, 1, "x", "high"), (0, -1, "x", "low"), (1, 1, "y", "high"), (1, -1, "y", "low")]
+
+
+@dataclass
+class Case:
+    """A state that may not be able to brake before an edge: axis 0 or 1, side +1 or -1."""
+
+    q: Array
+    dq: Array
+    axis: int
+    side: int
+    edge: float
+
+
+def rollout(arm: Arm, robot, table: Table, case: Case) -> float:
+    """Brake as hard as possible for 10 ms at a time; return where it ends beyond the edge [m], inf if it never does."""
+    q, dq = case.q.copy(), case.dq.copy()
+    for _ in range(MAX_STEPS):
+        jacobian = arm.jacobian(q)[:3]
+        position, velocity = np.array(arm.pose(q).translation), arm.velocity(q, dq)
+        bias = arm.acceleration(q, dq, np.zeros_like(q))
+        speed, beyond = case.side * velocity[case.axis], case.side * (position[case.axis] - case.edge)
+        if speed <= 0:
+            return beyond
+        height = -bias[2] - 0.5 * velocity[2] / STEP - 0.1 * (position[2] - table.z) / STEP**2
+        low = np.maximum(-robot.acceleration_limit, (-robot.velocity_limit - dq) / STEP)
+        high = np.minimum(robot.acceleration_limit, (robot.velocity_limit - dq) / STEP)
+        along = case.side * jacobian[case.axis]
+        best = linprog(
+            along, A_eq=jacobian[2:], b_eq=[height], bounds=list(zip(low, high, strict=True)), method="highs"
+        )
+        assert best.status == 0
+        slowing = -(along @ best.x + case.side * bias[case.axis])
+        if slowing > 0 and speed <= slowing * STEP:
+            return beyond + 0.5 * speed**2 / slowing
+        q, dq = q + STEP * (dq + 0.5 * STEP * best.x), dq + STEP * best.x
+    return math.inf
+
+
+@pytest.fixture(scope="module")
+def fast(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
+    """Moving starts and goals of a pipeline without any reach rule."""
+    prepared = prepare(without_stages(prepare("airhockey-replan").pipeline, "BallisticReach"))
+    return prepared, run_stages(prepared, DRAWS, seed=81)
+
+
+@pytest.fixture(scope="module")
+def suspects(fast: tuple[PreparedPipeline, Round]) -> list[Case]:
+    """States that a straight line of 80 ms carries off the table: starts, and goals reversed in time."""
+    prepared, batch = fast
+    table, arm = prepared.context.constraint(Table), Arm(prepared.context.robot)
+    cases = []
+    for end, sign in (("start", 1.0), ("goal", -1.0)):
+        for q, dq in zip(batch[f"{end}_q"].T, sign * batch[f"{end}_dq"].T, strict=True):
+            position, velocity = np.array(arm.pose(q).translation), arm.velocity(q, dq)
+            for axis, side, name, bound in EDGES:
+                edge = getattr(getattr(table, name), bound)
+                if side * velocity[axis] > 0 and side * (position[axis] + SUSPECT * velocity[axis] - edge) > 0:
+                    cases.append(Case(q, dq, axis, side, edge))
+    return cases
+
+
+def kernels(prepared: PreparedPipeline, backend: str, kernels_of):
+    table, library = prepared.context.constraint(Table), kernels_of(prepared, backend)
+    return table, library.load(tip_state), library.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_braking_ends_where_an_independent_roll_out_ends(fast, suspects, kernels_of, backend):
+    prepared, _ = fast
+    table, _, brake = kernels(prepared, backend, kernels_of)
+    arm = Arm(prepared.context.robot)
+    chosen = suspects[:: max(1, len(suspects) // 50)][:50]
+    assert len(chosen) == 50
+    assert len({(case.axis, case.side) for case in chosen}) >= 3
+    state = np.array([[*case.q, *case.dq, -1.0] for case in chosen]).T.copy()
+    normal = np.zeros((3, len(chosen)))
+    for k, case in enumerate(chosen):
+        normal[case.axis, k], normal[2, k] = case.side, case.side * case.edge
+    final, running = brake(state, normal)
+    expected = [rollout(arm, prepared.context.robot, table, case) for case in chosen]
+    found = np.where(running[0] < 0.5, final[-1], np.inf)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    assert min(expected) < -0.01 < 0.01 < max(expected)
+
+
+def test_states_that_are_not_suspect_can_brake(fast, kernels_of, fastest):
+    """The roll-out is spared where a straight line of 80 ms ends a millimetre inside: so do all of those."""
+    prepared, _ = fast
+    batch = run_stages(prepared, 20_000, seed=82)
+    table, tip, brake = kernels(prepared, fastest, kernels_of)
+    for end, sign in (("start", 1.0), ("goal", -1.0)):
+        q, dq = batch[f"{end}_q"], sign * batch[f"{end}_dq"]
+        position, velocity = tip(q, dq)
+        for axis, side, name, bound in EDGES:
+            edge = getattr(getattr(table, name), bound)
+            speed, ahead = side * velocity[axis], side * (position[axis] - edge)
+            calm = np.flatnonzero((speed > 0) & (ahead + SUSPECT * speed <= -1e-3))
+            normal = np.zeros((3, len(calm)))
+            normal[axis], normal[2] = side, side * edge
+            state = np.concatenate([q, dq, np.full((1, q.shape[1]), -1.0)])
+            final, running = brake(np.take(state, calm, axis=1), normal)
+            assert np.all(running[0] < 0.5)
+            assert final[-1].max() <= -1e-3
+
+
+def one(prepared: PreparedPipeline, q: Array, dq: Array) -> Round:
+    """A batch of one draw that starts with dq and arrives at rest."""
+    batch = Round(1)
+    for name, values in (("start_q", q), ("start_dq", dq), ("goal_q", q), ("goal_dq", 0 * dq)):
+        batch[name] = values[:, None].copy()
+    BrakingReach().prepare(prepared.context)(batch, random_generator(0, "train", 0))
+    return batch
+
+
+def test_states_that_obviously_can_brake_pass_and_those_that_obviously_cannot_fail(fast):
+    prepared, batch = fast
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    at_edge = batch["start_q"][:, np.argmax(batch["start_xyz"][1])]  # a millimetre or so from y = 0.45
+    in_middle = batch["start_q"][:, np.argmin(np.abs(batch["start_xyz"] - [[0.95], [0.0], [0.16]]).sum(0))]
+    for q in (at_edge, in_middle):
+        assert len(one(prepared, q, np.zeros(6)).alive) == 1
+    jacobian = arm.jacobian(at_edge)[:3]
+    outwards = np.linalg.pinv(jacobian) @ [0.0, 1.0, 0.0]
+    outwards *= 0.9 / np.max(np.abs(outwards) / robot.velocity_limit)
+    lost = one(prepared, at_edge, outwards)
+    assert lost.reasons[0] == "cannot brake at the start"
+    assert len(lost.alive) == 0
+    assert len(one(prepared, at_edge, -outwards).alive) == 1
+    assert len(one(prepared, in_middle, 0.05 * outwards).alive) == 1
+
+
+def test_a_goal_is_a_start_reversed_in_time(fast):
+    prepared, batch = fast
+    q, dq = batch["start_q"], batch["start_dq"]
+    ends = []
+    for start, goal in (("start", "goal"), ("goal", "start")):
+        moving = Round(q.shape[1])
+        moving[f"{start}_q"], moving[f"{start}_dq"] = q, dq if start == "start" else -dq
+        moving[f"{goal}_q"], moving[f"{goal}_dq"] = q, 0 * dq
+        BrakingReach().prepare(prepared.context)(moving, random_generator(0, "train", 0))
+        ends.append(moving.alive)
+    np.testing.assert_array_equal(*ends)
+    assert 0 < q.shape[1] - len(ends[0]) < 0.2 * q.shape[1]
+
+
+def test_the_margin_is_a_distance_before_the_edge(fast, kernels_of, fastest):
+    prepared, batch = fast
+    table, tip, brake = kernels(prepared, fastest, kernels_of)
+    excess = overshoot(tip, brake, table, batch["start_q"], batch["start_dq"], margin=0.02)
+    for margin in (0.0, 1e-3, 0.02):
+        again = Round(batch["start_q"].shape[1])
+        for name in ("start_q", "start_dq", "goal_q"):
+            again[name] = batch[name]
+        again["goal_dq"] = 0 * batch["goal_dq"]
+        BrakingReach(margin=margin).prepare(prepared.context)(again, random_generator(0, "train", 0))
+        np.testing.assert_array_equal(again.alive, np.flatnonzero(excess <= -margin))
+    assert np.sum((excess > -0.02) & (excess <= 0)) > 0
+
+
+def braking_variant(folder: Path, name: str) -> Path:
+    """Write the shipped pipeline with braking-reach in place of its ballistic rules."""
+    head, *stages = find_recipe("pipeline", name).read_text().split("[[stage]]")
+    kept = [stage for stage in stages if "ballistic-reach" not in stage]
+    path = folder / f"{name}-braking.toml"
+    path.write_text("[[stage]]".join([head, *kept, '\nuse = "braking-reach"\nmargin = "1 mm"\n']))
+    return path
+
+
+@pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
+def test_a_recipe_with_braking_reach_makes_blocks_and_rejects_less_than_the_ballistic_rule(
+    prepare: Prepare, tmp_path, name
+):
+    braking = prepare(load_pipeline(braking_variant(tmp_path, name)), "numpy").block(1, "train", 0, stop=1200).outcome
+    ballistic = prepare(name).block(1, "train", 0, stop=1200).outcome
+    lost = [
+        sum(count for reason, count in outcome.rejections.items() if "leaves the table" in reason or "brake" in reason)
+        for outcome in (braking, ballistic)
+    ]
+    assert braking.accepted == ballistic.accepted == 1200
+    assert 0 < lost[0] / braking.tried < 0.5 * lost[1] / ballistic.tried

@@ -1,0 +1,30 @@
+"""Cases that were hard once: found by comparing thousands of samples with SciPy's SLSQP from several starts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
+from cnpgen.pipelines.stages.hitting_newton import objective
+from cnpgen.pipelines.stages.stage import Round
+from tests.conftest import Prepare
+
+CASES = json.loads((Path(__file__).parents[1] / "data" / "hitting_configurations.json").read_text())
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['best']:.3f}")
+def test_where_there_are_two_local_optima_the_better_hitting_configuration_is_found(
+    prepare: Prepare, case: dict
+) -> None:
+    prepared = prepare("airhockey-replan")
+    (stage,) = (each for each in prepared.pipeline.stage if isinstance(each, HittingConfiguration))
+    batch = Round(1)
+    for name in ("start_q", "goal_xyz"):
+        batch[name] = np.array(case[name])[:, None]
+    direction = np.array(case["direction"])[:, None]
+    batch["hit_angle"] = np.arctan2(direction[1:], direction[:1])
+    stage.prepare(prepared.context)(batch, np.random.default_rng())
+    (found,) = prepared.context.kernels.load(objective)(batch["goal_q"], direction, batch["start_q"])
+    assert found[0, 0] >= case["best"] - 1e-6

@@ -1,0 +1,153 @@
+"""Velocities and accelerations on the table manifold: exactly on it, within every limit, by Pinocchio."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import RecipeError
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
+from cnpgen.pipelines.stages.motion import TableAcceleration, TableVelocity, table_acceleration, table_velocity
+from cnpgen.pipelines.stages.stage import Round
+from tests.conftest import Arm, Prepare, run_stages
+
+EXACT = 1e-9  # m/s and m/s^2
+DRAWS = 2000
+
+
+@pytest.fixture(scope="module")
+def moving(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
+    prepared = prepare("airhockey-replan")
+    return prepared, run_stages(prepared, DRAWS, seed=61)
+
+
+def test_start_velocities_are_horizontal_and_within_their_limits(moving):
+    prepared, batch = moving
+    arm, limit = Arm(prepared.context.robot), prepared.context.robot.velocity_limit
+    for q, dq, tip in zip(batch["start_q"].T, batch["start_dq"].T, batch["start_tip_velocity"].T, strict=True):
+        velocity = arm.velocity(q, dq)
+        assert abs(velocity[2]) < EXACT
+        np.testing.assert_allclose(velocity, tip, atol=1e-12)
+        assert np.all(np.abs(dq) <= limit * (1 + 1e-15))
+
+
+def test_start_accelerations_keep_the_tip_on_the_table_and_every_limit(moving):
+    prepared, batch = moving
+    robot = prepared.context.robot
+    arm = Arm(robot)
+    for q, dq, ddq in zip(batch["start_q"].T, batch["start_dq"].T, batch["start_ddq"].T, strict=True):
+        assert abs(arm.acceleration(q, dq, ddq)[2]) < EXACT
+        assert np.all(np.abs(ddq) <= robot.acceleration_limit * (1 + 1e-12))
+        assert np.all(np.abs(arm.torque(q, dq, ddq)) <= robot.torque_limit * (1 + 1e-12))
+
+
+def test_no_draw_is_lost_to_accelerations(moving):
+    _, batch = moving
+    for reason in ("no acceleration within the limits at the start", "no velocity on the manifold"):
+        assert np.sum(batch.fate == 1 + batch.reasons.index(reason)) == 0
+
+
+def test_the_ends_of_the_interval_of_accelerations_are_on_a_limit_and_a_step_beyond_breaks_it(moving):
+    prepared, batch = moving
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    kernel = prepared.context.kernels.load(table_acceleration)
+    q, dq = batch["start_q"][:, :300].copy(), batch["start_dq"][:, :300].copy()
+    direction = np.random.default_rng(62).uniform(-1, 1, q.shape)
+
+    def load(length: float) -> np.ndarray:
+        """The largest fraction of any limit that is used."""
+        ddq, _ = kernel(q, dq, direction, np.full((1, q.shape[1]), length))
+        torque = np.array([arm.torque(*state) for state in zip(q.T, dq.T, ddq.T, strict=True)])
+        return np.maximum(np.abs(ddq.T) / robot.acceleration_limit, np.abs(torque) / robot.torque_limit).max(1)
+
+    for end, beyond in ((0.0, -1e-3), (1.0, 1.001)):
+        np.testing.assert_allclose(load(end), 1.0, rtol=1e-9)
+        assert np.all(load(beyond) > 1.0)
+    assert np.all(load(0.5) < 1.0)
+
+
+def with_torque_scale(pipeline: Pipeline, scale: float) -> Pipeline:
+    problem = pipeline.problem
+    return replace(pipeline, problem=replace(problem, limits=replace(problem.limits, torque_scale=scale)))
+
+
+@pytest.fixture(scope="module")
+def weak(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
+    """The same arm with a fifth of its torque: enough to hold still, hardly more."""
+    prepared = prepare(with_torque_scale(prepare("airhockey-replan").pipeline, 0.2), "numpy")
+    return prepared, run_stages(prepared, DRAWS, seed=61)
+
+
+def test_small_torque_limits_hold_exactly(weak):
+    prepared, batch = weak
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    states = zip(batch["start_q"].T, batch["start_dq"].T, batch["start_ddq"].T, strict=True)
+    ratio = np.array([np.abs(arm.torque(*state)) / robot.torque_limit for state in states]).max(1)
+    assert len(ratio) > 500
+    assert ratio.max() <= 1 + 1e-12
+
+
+def test_small_torque_limits_are_what_bounds_the_acceleration(weak, moving):
+    prepared, batch = weak
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    kernel = prepared.context.kernels.load(table_acceleration)
+    q, dq = batch["start_q"], batch["start_dq"]
+    direction = np.random.default_rng(63).uniform(-1, 1, q.shape)
+    ddq, room = kernel(q, dq, direction, np.ones((1, q.shape[1])))
+    fine = room[0] >= 0
+    states = list(zip(q.T[fine], dq.T[fine], ddq.T[fine], strict=True))
+    torque = np.array([np.abs(arm.torque(*state)) / robot.torque_limit for state in states]).max(1)
+    acceleration = (np.abs(ddq.T[fine]) / robot.acceleration_limit).max(1)
+    assert np.mean(np.abs(torque - 1) < 1e-9) > 0.2
+    np.testing.assert_allclose(np.maximum(torque, acceleration), 1.0, rtol=1e-9)
+    strong, _ = moving[0].context.kernels.load(table_acceleration)(q, dq, direction, np.ones((1, q.shape[1])))
+    assert np.mean(np.abs(strong - ddq).max(0) > 1e-6) > 0.2
+
+
+def test_draws_that_cannot_be_accelerated_within_tiny_torque_limits_are_rejected_and_counted(prepare: Prepare):
+    """Holding still takes more than these limits: no acceleration is left."""
+    prepared = prepare(with_torque_scale(prepare("airhockey-replan").pipeline, 0.02), "numpy")
+    batch = run_stages(prepared, 500, seed=61)
+    reason = batch.reasons.index("no acceleration within the limits at the start")
+    assert np.sum(batch.fate == 1 + reason) > 300
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    for state in zip(batch["start_q"].T, batch["start_dq"].T, batch["start_ddq"].T, strict=True):
+        assert np.all(np.abs(arm.torque(*state)) <= robot.torque_limit * (1 + 1e-12))
+
+
+def test_an_acceleration_at_the_goal_is_drawn_the_same_way(prepare: Prepare):
+    pipeline = prepare("airhockey-replan").pipeline
+    prepared = prepare(replace(pipeline, stage=(*pipeline.stage, TableAcceleration(end="goal"))), "numpy")
+    block = prepared.block(1, "train", 0, stop=200)
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    assert "goal_ddq" in [field.name for field in prepared.fields]
+    columns = block.columns
+    for q, dq, ddq in zip(columns["goal_q"].T, columns["goal_dq"].T, columns["goal_ddq"].T, strict=True):
+        assert abs(arm.acceleration(q, dq, ddq)[2]) < EXACT
+        assert np.all(np.abs(ddq) <= robot.acceleration_limit * (1 + 1e-12))
+        assert np.all(np.abs(arm.torque(q, dq, ddq)) <= robot.torque_limit * (1 + 1e-12))
+
+
+def test_velocities_in_a_singular_pose_stay_within_their_limits_and_on_the_table(prepare: Prepare):
+    prepared = prepare("airhockey-replan")
+    robot, arm = prepared.context.robot, Arm(prepared.context.robot)
+    kernel = prepared.context.kernels.load(table_velocity)
+    q = np.repeat(np.where(np.arange(6) % 2 == 0, 0.0, robot.base)[:, None], 200, axis=1)
+    random = np.random.default_rng(64)
+    dq, _ = kernel(q, random.uniform(-1, 1, q.shape), random.random((1, 200)))
+    assert np.all(np.abs(dq) <= robot.velocity_limit[:, None])
+    assert max(abs(arm.velocity(*state)[2]) for state in zip(q.T, dq.T, strict=True)) < EXACT
+
+
+@pytest.mark.parametrize("stage", [TableVelocity(at_rest=0.2), TableAcceleration()])
+def test_problems_without_a_table_have_no_table_velocity(prepare: Prepare, stage):
+    with pytest.raises(RecipeError, match=r"needs a constraint 'table', which the problem .* does not have"):
+        stage.prepare(prepare("heavy-object").context)
+
+
+def test_all_starts_may_be_at_rest(prepare: Prepare):
+    prepared = prepare("airhockey-replan")
+    batch = run_stages(prepared, 100, until="StartIK")
+    TableVelocity(at_rest=1.0).prepare(prepared.context)(batch, random_generator(1, "train", 0))
+    np.testing.assert_array_equal(batch["start_dq"], 0.0)

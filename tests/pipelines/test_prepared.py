@@ -1,0 +1,284 @@
+"""Blocks: pure functions of seed, split and index, in pieces of any size, the same with any backend."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import RecipeError
+from cnpgen.pipelines.piece import Block
+from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
+from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
+from cnpgen.store.field import Field
+from cnpgen.store.outcome import Fates, merge_fates
+from tests.conftest import SHIPPED, Prepare, needs_compiler
+
+CLOSE = 1e-9  # SI: what backends may differ by
+SEED = 20261121
+
+
+@pytest.fixture(scope="module", params=SHIPPED)
+def prepared(request: pytest.FixtureRequest, prepare: Prepare) -> PreparedPipeline:
+    return prepare(request.param)
+
+
+@pytest.fixture(scope="module")
+def whole(prepared: PreparedPipeline) -> Block:
+    return prepared.block(SEED, "train", 0)
+
+
+def assert_same_columns(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def assert_same_outcome(found: Fates, expected: Fates) -> None:
+    assert (found.tried, found.accepted) == (expected.tried, expected.accepted)
+    assert dict(found.rejections) == dict(expected.rejections)
+    for name, density in expected.densities.items():
+        np.testing.assert_array_equal(found.densities[name].drawn, density.drawn)
+        np.testing.assert_array_equal(found.densities[name].accepted, density.accepted)
+
+
+def test_a_block_made_twice_is_the_same_to_the_bit(prepared, whole):
+    again = prepared.block(SEED, "train", 0)
+    assert_same_columns(again.columns, whole.columns)
+    assert_same_outcome(again.outcome, whole.outcome)
+
+
+@pytest.mark.parametrize("other", [(SEED + 1, "train", 0), (SEED, "validation", 0), (SEED, "train", 1)])
+def test_blocks_of_another_seed_split_or_index_share_no_row(prepared, whole, other):
+    columns = prepared.block(*other, stop=500).columns
+    assert not np.isin(columns["goal_xyz"][0], whole.columns["goal_xyz"][0]).any()
+    first = other[2] * BLOCK_ROWS
+    np.testing.assert_array_equal(columns["sample_id"], [np.arange(first, first + 500)])
+
+
+def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple[dict[str, np.ndarray], Fates]:
+    """Make a block piece by piece."""
+    made = [
+        prepared.block(SEED, "train", index, first=first, stop=stop)
+        for first, stop in zip([0, *cuts], [*cuts, BLOCK_ROWS], strict=True)
+    ]
+    columns = {name: np.concatenate([part.columns[name] for part in made], axis=1) for name in made[0].columns}
+    return columns, merge_fates([part.outcome for part in made])
+
+
+@pytest.mark.parametrize("cuts", [[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]])
+def test_pieces_of_a_block_are_its_rows_and_their_outcomes_add_up(prepared, whole, cuts):
+    columns, outcome = pieces(prepared, cuts)
+    assert_same_columns(columns, whole.columns)
+    assert_same_outcome(outcome, whole.outcome)
+
+
+def test_pieces_that_are_asked_for_together_are_those_asked_for_one_by_one(prepared, whole):
+    ranges = [(0, 1), (1, 64), (64, 1500), (1700, 1701), (3000, BLOCK_ROWS)]  # with gaps
+    drawn = []
+    run = PreparedPipeline._round
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PreparedPipeline, "_round", lambda *x: (drawn.append(x[2]), run(*x))[1])
+        together = list(prepared.pieces(SEED, "train", 0, ranges))
+    assert sum(drawn) < 1.3 * whole.outcome.tried + 300
+    assert len(together) == len(ranges)
+    for (first, stop), piece in zip(ranges, together, strict=True):
+        alone = prepared.block(SEED, "train", 0, first=first, stop=stop)
+        assert_same_columns(piece.columns, alone.columns)
+        assert_same_outcome(piece.outcome, alone.outcome)
+
+
+def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[int]]:
+    """Rows that there are after each round of a block, and draws rejected at the end of each round."""
+    sizes, tails = [], []
+    run = PreparedPipeline._round
+
+    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
+        batch = run(self, random, size)
+        sizes.append(len(batch.alive))
+        tails.append(batch.size - 1 - int(batch.alive[-1]))
+        return batch
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PreparedPipeline, "_round", noted)
+        prepared.block(SEED, "train", index)
+    return np.cumsum(sizes).tolist(), tails
+
+
+def test_a_piece_that_begins_with_a_round_counts_the_draws_rejected_at_the_end_of_the_one_before(prepare: Prepare):
+    prepared = prepare("heavy-object")
+    tested = 0
+    for index in range(20):
+        ends, tails = round_ends(prepared, index)
+        if tails[0] == 0 or tested == 3:
+            continue
+        tested += 1
+        whole, (columns, outcome) = prepared.block(SEED, "train", index), pieces(prepared, [ends[0]], index)
+        assert_same_columns(columns, whole.columns)
+        assert_same_outcome(outcome, whole.outcome)
+    assert tested == 3
+
+
+def test_a_shorter_block_is_the_beginning_of_a_longer_one(prepared, whole):
+    for stop in (1, 7, 1500, 2900):
+        short = prepared.block(SEED, "train", 0, stop=stop)
+        assert_same_columns(short.columns, {name: values[:, :stop] for name, values in whole.columns.items()})
+        assert short.outcome.accepted == stop
+        assert short.outcome.tried == whole.columns["attempts"][0, :stop].sum()
+
+
+# --- counts -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_draw_is_accepted_or_counted_under_one_reason(prepared, whole):
+    outcome = whole.outcome
+    assert outcome.accepted == BLOCK_ROWS == whole.columns["attempts"].shape[1]
+    assert outcome.tried == outcome.accepted + sum(outcome.rejections.values())
+    assert sum(outcome.rejections.values()) > 100
+
+
+def test_attempts_sum_to_the_draws_tried(prepared, whole):
+    attempts = whole.columns["attempts"]
+    assert attempts.dtype == np.int64
+    assert attempts.min() == 1
+    assert attempts.sum() == whole.outcome.tried
+
+
+def test_attempts_count_the_draws_from_one_row_to_the_next_across_rounds(prepared, whole):
+    """Made again draw by draw: all rounds' fates in one row."""
+    fates: list[int] = []
+    run = PreparedPipeline._round
+
+    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
+        batch = run(self, random, size)
+        fates.extend(batch.fate.tolist())
+        return batch
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PreparedPipeline, "_round", noted)
+        prepared.block(SEED, "train", 0)
+    accepted = np.flatnonzero(np.array(fates) == 0)[:BLOCK_ROWS]
+    np.testing.assert_array_equal(whole.columns["attempts"][0], np.diff(accepted, prepend=-1))
+
+
+def test_every_reason_that_a_stage_or_a_constraint_has_is_listed_even_if_nothing_was_rejected_for_it(prepared, whole):
+    reasons = list(whole.outcome.rejections)
+    constraints = [constraint.reason for constraint in prepared.context.problem.constraint]
+    assert reasons[0] == "too close together"
+    assert [reason for reason in reasons if reason in constraints] == constraints
+    assert "tip not at its position" in reasons
+    assert len(set(reasons)) == len(reasons)
+
+
+def test_density_maps_count_every_draw_and_every_row(prepared, whole):
+    assert whole.outcome.densities.keys() == {"start_xyz", "goal_xyz"}
+    for name, density in whole.outcome.densities.items():
+        assert density.drawn.sum() == whole.outcome.tried
+        assert density.accepted.sum() == BLOCK_ROWS
+        x, y, _ = whole.columns[name]
+        expected, _, _ = np.histogram2d(x, y, density.accepted.shape, [density.x, density.y])
+        np.testing.assert_allclose(density.accepted, expected, atol=2)  # a draw on the line between two cells
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_nothing_that_the_stages_pass_on_is_rejected_at_the_last_gate(prepare: Prepare, name):
+    """The stages are exact: the gate is there for what nobody has thought of."""
+    prepared = prepare(name)
+    outcome = merge_fates([prepared.block(SEED, "test", index).outcome for index in range(8)])
+    gate = [constraint.reason for constraint in prepared.context.problem.constraint]
+    gate += ["tip not at its position", "hit not along its direction"]
+    assert {reason: count for reason, count in outcome.rejections.items() if reason in gate and count} == {}
+
+
+def test_a_pipeline_that_accepts_nothing_is_given_up_with_its_reasons(prepare: Prepare):
+    pipeline = prepare("airhockey-hit").pipeline
+    stages = [
+        replace(stage, min_speed=100.0) if isinstance(stage, HittingVelocity) else stage for stage in pipeline.stage
+    ]
+    prepared = prepare(replace(pipeline, stage=tuple(stages)))
+    text = (
+        r"airhockey-hit\.toml: 0 of [\d,]+ draws were accepted; of the last [\d,]+, rejected for no hitting velocity \("
+    )
+    with pytest.raises(RecipeError, match=text):
+        prepared.block(1, "train", 0)
+
+
+# --- backends ---------------------------------------------------------------------------------------------------------
+
+
+def same_round(prepared: PreparedPipeline, size: int) -> Round:
+    return prepared._round(random_generator(SEED, "train", 0), size)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(("backend", "size"), [pytest.param("compiled", 6000, marks=needs_compiler), ("casadi", 300)])
+def test_backends_agree_on_the_same_draws(prepare: Prepare, name, backend, size):
+    """But for draws on the verge of being rejected and for searches that end in another of two equal optima."""
+    one, other = same_round(prepare(name, "numpy"), size), same_round(prepare(name, backend), size)
+    flipped = np.setxor1d(one.alive, other.alive)
+    assert len(flipped) <= 2
+    assert set(one.reasons) == set(other.reasons)
+    common = np.intersect1d(one.alive, other.alive)
+    rows = [np.searchsorted(batch.alive, common) for batch in (one, other)]
+    assert one.columns.keys() == other.columns.keys()
+    off = np.zeros(len(common), bool)
+    for column in one.columns:
+        differences = np.abs(one[column][:, rows[0]] - other[column][:, rows[1]])
+        off |= differences.max(0) > CLOSE
+    assert off.sum() <= 1e-3 * len(common)
+
+
+# --- rows in float32 --------------------------------------------------------------------------------------------------
+
+
+def test_rounding_to_float32_never_leaves_a_limit(prepare: Prepare):
+    robot = prepare("heavy-object").context.robot
+    field = Field("x", "rad", "", 7, valid_min=tuple(robot.position_lower), valid_max=tuple(robot.position_upper))
+    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    inside = np.concatenate([low, high, np.nextafter(low, 0), np.nextafter(high, 0), 0.5 * (low + high)], axis=1)
+    stored = as_stored(inside, field)
+    np.testing.assert_array_equal(stored, stored.astype(np.float32))
+    assert np.all(low <= stored)
+    assert np.all(stored <= high)
+    np.testing.assert_allclose(stored, inside, rtol=2e-7)
+
+
+def test_what_is_beyond_a_limit_before_rounding_stays_beyond(prepare: Prepare):
+    field = Field("x", "rad", "", 1, valid_min=(-1 / 3,), valid_max=(1 / 3,))
+    beyond = np.array([[-0.34, 0.34, np.nan]])
+    np.testing.assert_array_equal(as_stored(beyond, field), beyond.astype(np.float32).astype(float))
+
+
+def test_fields_without_limits_are_rounded_to_the_nearest(prepare: Prepare):
+    values = np.random.default_rng(0).normal(size=(2, 50))
+    np.testing.assert_array_equal(as_stored(values, Field("x", "m", "", 2)), values.astype(np.float32))
+
+
+# --- fields -----------------------------------------------------------------------------------------------------------
+
+
+def test_rows_have_the_fields_that_are_promised_in_that_order(prepared, whole):
+    assert sorted(whole.columns) == sorted(field.name for field in prepared.fields)
+    for field in prepared.fields:
+        assert whole.columns[field.name].shape == (max(field.width, 1), BLOCK_ROWS)
+        assert len(field.names) == field.width
+    names = [field.name for field in prepared.fields]
+    assert names[:5] == ["start_q", "start_dq", "start_ddq", "goal_q", "goal_dq"]
+    assert names[-2:] == ["attempts", "sample_id"]
+
+
+def test_values_are_within_the_limits_that_their_fields_state(prepared, whole):
+    for field in prepared.fields:
+        values = whole.columns[field.name]
+        if field.valid_min is not None:
+            assert np.all(values >= np.array(field.valid_min)[:, None] - 1e-14), field.name
+        if field.valid_max is not None:
+            assert np.all(values <= np.array(field.valid_max)[:, None] + 1e-14), field.name
+
+
+def test_random_numbers_depend_on_seed_split_and_block():
+    draw = partial(lambda *key: random_generator(*key).random(4).tolist())
+    keys = [(0, "train", 0), (1, "train", 0), (0, "validation", 0), (0, "train", 1), (2**63, "train", 0)]
+    assert len({tuple(draw(*key)) for key in keys}) == len(keys)
+    assert draw(*keys[0]) == draw(*keys[0])

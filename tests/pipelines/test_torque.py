@@ -1,0 +1,66 @@
+"""Holding torque: Pinocchio's gravity torque, payload included."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cnpgen.pipelines.stages.torque import GravityTorque, torque_ratio
+from tests.conftest import Arm, Prepare, needs_compiler, run_stages
+
+BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ["heavy-object", "airhockey-hit"])
+def test_the_ratio_is_the_largest_gravity_torque_by_its_limit(prepare: Prepare, kernels_of, name, backend):
+    prepared = prepare(name)
+    robot, arm, random = prepared.context.robot, Arm(prepared.context.robot), np.random.default_rng(101)
+    q = random.uniform(robot.position_lower, robot.position_upper, (300, robot.n)).T.copy()
+    (ratio,) = kernels_of(prepared, backend).load(torque_ratio)(q)
+    zero = np.zeros(robot.n)
+    expected = [np.max(np.abs(arm.torque(x, zero, zero)) / robot.torque_limit) for x in q.T]
+    np.testing.assert_allclose(ratio[0], expected, rtol=1e-12)
+
+
+def test_the_payload_is_part_of_the_torque(prepare: Prepare):
+    """Twelve kilograms on a stretched arm: without them, the shoulder needs far less."""
+    robot = prepare("heavy-object").context.robot
+    arm, zero = Arm(robot), np.zeros(7)
+    stretched = np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    reach = np.linalg.norm(np.array(arm.pose(stretched).translation)[:2])
+    assert abs(arm.torque(stretched, zero, zero)[1]) > 12 * 9.8 * reach
+
+
+def test_torque_ratios_of_accepted_rows_are_stored_and_at_most_one(prepare: Prepare):
+    prepared = prepare("heavy-object")
+    batch = run_stages(prepared, 1500, seed=102)
+    robot, arm, zero = prepared.context.robot, Arm(prepared.context.robot), np.zeros(7)
+    for end in ("start", "goal"):
+        expected = [np.max(np.abs(arm.torque(q, zero, zero)) / robot.torque_limit) for q in batch[f"{end}_q"].T]
+        np.testing.assert_allclose(batch[f"{end}_torque_ratio"][0], expected, rtol=1e-12)
+        assert 0.3 < max(expected) <= 1
+
+
+def test_configurations_that_need_too_much_torque_are_rejected_and_counted(prepare: Prepare):
+    pipeline = prepare("heavy-object").pipeline
+    problem = replace(pipeline.problem, limits=replace(pipeline.problem.limits, torque_scale=0.35))
+    prepared = prepare(replace(pipeline, problem=problem), "numpy")
+    batch = run_stages(prepared, 1500, seed=102)
+    counts = np.bincount(batch.fate, minlength=1 + len(batch.reasons))[1:]
+    fates = dict(zip(batch.reasons, counts.tolist(), strict=True))
+    assert fates["joint torque limit at the start"] > 50
+    assert fates["joint torque limit at the goal"] > 10
+    robot, arm, zero = prepared.context.robot, Arm(prepared.context.robot), np.zeros(7)
+    for end in ("start", "goal"):
+        for q in batch[f"{end}_q"].T:
+            assert np.all(np.abs(arm.torque(q, zero, zero)) <= robot.torque_limit * (1 + 1e-12))
+
+
+@pytest.mark.parametrize("end", ["start", "goal"])
+def test_the_stage_says_which_end_it_is_about(prepare: Prepare, end):
+    stage = GravityTorque(end=end)
+    assert stage.needs == (f"{end}_q",)
+    assert f"the {end} configuration, payload included" in stage.describe()
+    (field,) = stage.provides(prepare("heavy-object").context)
+    assert field.name == f"{end}_torque_ratio"

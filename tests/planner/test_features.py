@@ -1,0 +1,47 @@
+"""The network's inputs: what they are, and that they are standardised as the training rows were."""
+
+import numpy as np
+import pytest
+
+from cnpgen.planner.network.features import BLOCKS, fit_features, raw_features
+from tests.planner.test_control_points import tasks
+
+
+def test_features_of_the_rows_they_were_fitted_to_have_mean_zero_and_deviation_one():
+    given = tasks()
+    found = fit_features([given]).of(given, "float64")
+    np.testing.assert_allclose(found.mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(found.std(axis=0), 1, rtol=1e-9)
+
+
+def test_the_moments_of_parts_are_those_of_the_whole():
+    given = tasks()
+    whole, parts = fit_features([given]), fit_features(given.take(rows) for rows in (slice(0, 1), slice(1, None)))
+    np.testing.assert_allclose(parts.mean, whole.mean, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(parts.scale, whole.scale, rtol=1e-9)
+
+
+def test_what_was_constant_in_the_training_rows_is_zero_and_not_nan_for_any_row():
+    given, other = tasks(seed=0), tasks(seed=1)
+    given.boundary.start_dq[:] = 0.5
+    features = fit_features([given])
+    found = features.of(other)
+    assert np.isfinite(found).all()
+    np.testing.assert_array_equal(found[:, 3:6], 0)  # where start_dq is
+    assert (np.abs(found[:, :3]) > 0).all()
+
+
+def test_features_are_states_their_sines_tips_and_the_expected_time():
+    given = tasks()
+    raw, b = raw_features(given, BLOCKS), given.boundary
+    expected = [
+        b.start_q, b.start_dq, b.start_ddq, b.goal_q, b.goal_dq,
+        np.sin(b.start_q), np.sin(b.goal_q), np.cos(b.start_q), np.cos(b.goal_q),
+        given.start_xyz, given.goal_xyz, np.log(given.expected_time)[:, None],
+    ]  # fmt: skip
+    np.testing.assert_allclose(raw, np.concatenate(expected, axis=1))
+
+
+def test_a_block_that_nobody_knows_is_refused_with_those_that_are_known():
+    with pytest.raises(ValueError, match=r"'colour'.*start_q, start_dq"):
+        raw_features(tasks(), ("colour",))

@@ -1,0 +1,106 @@
+"""The landing: plans are on the manifold behind it, boundary control points stay, gradients are exact."""
+
+import numpy as np
+import pytest
+
+from cnpgen.planner.control_points import control_points
+from cnpgen.planner.kit import make_kit
+from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.preparation import ends_of, lanes, rows
+from cnpgen.trajectory.boundary import anchor_line, assemble
+from tests.conftest import columns_of
+from tests.examples.models import boundary_of_columns, surroundings_of
+from tests.planner.test_parts import heights, worst_tilt
+
+DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
+
+
+def landing_of(name: str) -> Landing:
+    given = surroundings_of(name)
+    return make_landing(given.problem, given.kernels, steps=1)
+
+
+def nearby(tiny, name: str, count: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """Paths near the manifold, as a network gives them, and heights of obstacles."""
+    given = surroundings_of(name)
+    boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), count)
+    kit = make_kit(given, bending_steps=1, landing_steps=0, slow_down=False)
+    tasks, spec = kit.prepare(boundary), given.problem.trajectory
+    rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
+    interior = anchor_line(boundary, rate, spec) + tasks.correction
+    interior += 0.05 * np.random.default_rng(0).uniform(-1, 1, interior.shape)
+    return assemble(boundary, interior, rate, spec), kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+
+
+def test_a_plan_near_the_table_is_on_it_behind_the_landing(tiny):
+    path, tops = nearby(tiny, "airhockey")
+    before, after = heights(path), heights(landing_of("airhockey").land(path, tops))
+    assert np.median(before) > 0.01
+    assert np.median(after) < 0.05 * np.median(before)
+    assert (after < 0.3 * before).all()
+
+
+def test_an_object_that_is_nearly_upright_is_so_behind_the_landing(tiny):
+    path, tops = nearby(tiny, "heavy-object", 4)
+    landed = landing_of("heavy-object").land(path, tops)
+    before, after = ([worst_tilt("heavy-object", each) for each in paths] for paths in (path, landed))
+    assert np.median(before) > 0.03
+    assert np.max(after) < 0.2 * np.median(before)
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, name):
+    path, tops = nearby(tiny, name)
+    given = path.copy()
+    landed = landing_of(name).land(path, tops)
+    np.testing.assert_array_equal(path, given)
+    np.testing.assert_array_equal(landed[:, [0, 1, 2, 13, 14]], path[:, [0, 1, 2, 13, 14]])
+    assert landing_of(name).land(path.astype(np.float32), tops).dtype == np.float32
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_gradients_behind_the_landing_are_taken_back_exactly(tiny, name):
+    path, tops = nearby(tiny, name, 3)
+    landing, random = landing_of(name), np.random.default_rng(1)
+    gradient = random.normal(size=path.shape)
+    back = landing.pull_back(path, tops, gradient)
+    for direction in random.normal(size=(6, *path.shape)):
+        step = 1e-6 * direction
+        high, low = (landing.land(path + sign * step, tops) for sign in (1, -1))
+        found = ((high - low) * gradient).sum(axis=(1, 2)) / 2e-6
+        np.testing.assert_allclose((back * direction).sum(axis=(1, 2)), found, rtol=1e-5, atol=1e-6)
+
+
+def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):
+    path, tops = nearby(tiny, "airhockey")
+    landing, broken = landing_of("airhockey"), path.copy()
+    broken[2, 5] = np.nan
+    found, expected = landing.land(broken, tops), landing.land(path, tops)
+    others = [0, 1, *range(3, 8)]
+    np.testing.assert_array_equal(found[others], expected[others])
+    assert np.isnan(found[2]).any()
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name):
+    given = surroundings_of(name)
+    boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), 8)
+    kit = make_kit(given, bending_steps=1, landing_steps=1, slow_down=False)
+    tasks, random = kit.prepare(boundary), np.random.default_rng(2)
+    phi, log_rate = random.uniform(-1, 1, (8, 10 * given.robot.n)), random.normal(0, 0.3, (8, 20))
+    points = control_points(tasks, phi, log_rate, scale=0.1, spec=given.problem.trajectory)
+    tops = kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+    expected = landing_of(name).land(points.path, tops)
+    offsets = 0.1 * phi + tasks.correction.reshape(8, -1)
+    (found,) = kit.path(ends_of(boundary), lanes(offsets), lanes(points.rate), lanes(tops))
+    np.testing.assert_allclose(rows(found, given.robot.n), expected, atol=1e-10)
+
+
+def test_the_bent_line_is_the_papers_line_bent(tiny):
+    given = surroundings_of("heavy-object")
+    boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 5)
+    tasks = make_kit(given, bending_steps=1, landing_steps=0, slow_down=False).prepare(boundary)
+    rate, spec = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1), given.problem.trajectory
+    line = anchor_line(boundary, rate, spec)
+    bent = landing_of("heavy-object").land(assemble(boundary, line, rate, spec), np.zeros((5, 2)))
+    np.testing.assert_allclose(tasks.correction, bent[:, 3:13] - line, atol=1e-12)

@@ -1,0 +1,136 @@
+"""Model files: what is written comes back; what is damaged, cut off, or of something else is an error."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.errors import CnpgenError, DatasetError, UsageError
+from cnpgen.planner import model_file
+from cnpgen.planner.model import Model
+from cnpgen.planner.model_file import find_model, load_model, save_model
+from cnpgen.store.files.sealed import Content, read_sealed, seal
+from tests.conftest import columns_of
+from tests.examples.models import boundary_of_columns, untrained_model
+
+
+@pytest.fixture(scope="module")
+def model(tiny) -> Model:
+    made = untrained_model("airhockey", boundary_of_columns(columns_of(tiny("airhockey-hit")), 20))
+    return replace(made, training={"command": "cnpgen train", "score": {"valid": 0.5}}, log='{"step": 1}\n')
+
+
+def test_a_model_comes_back_as_it_was_written(model, tmp_path):
+    save_model(tmp_path / "m.h5", model)
+    found = load_model(tmp_path / "m.h5")
+    np.testing.assert_array_equal(found.parameters, model.parameters)
+    np.testing.assert_array_equal(found.features.mean, model.features.mean)
+    np.testing.assert_array_equal(found.features.scale, model.features.scale)
+    for name in ("architecture", "meaning", "rest", "training", "log"):
+        assert getattr(found, name) == getattr(model, name)
+    assert found.features.blocks == model.features.blocks
+    assert found.problem.digest == model.problem.digest
+
+
+def test_equal_models_give_equal_bytes(model, tmp_path):
+    for name in ("a.h5", "b.h5"):
+        save_model(tmp_path / name, model)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_any_hdf5_reader_opens_a_model_and_finds_the_layers_by_name(model, tmp_path):
+    save_model(tmp_path / "m.h5", model)
+    with h5py.File(tmp_path / "m.h5") as file:
+        assert file["trunk_0_weight"].shape == (model.architecture.inputs, 16)
+        assert file["rate_output_bias"].shape == (20,)
+        assert b"cnpgen train" in file["training"][()].tobytes()
+
+
+def test_a_changed_bit_anywhere_is_noticed(model, tmp_path):
+    save_model(tmp_path / "m.h5", model)
+    whole = (tmp_path / "m.h5").read_bytes()
+    used = [*range(80), *np.random.default_rng(0).integers(512, len(whole), 60).tolist()]
+    for place in used:
+        data = bytearray(whole)
+        data[place] ^= 1 << (place % 8)
+        (tmp_path / "m.h5").write_bytes(data)
+        with pytest.raises(DatasetError, match=r"m\.h5"):
+            load_model(tmp_path / "m.h5")
+
+
+@pytest.mark.parametrize("size", [0, 40, 512, 5000, -1])
+def test_a_model_that_was_cut_off_is_an_error(model, tmp_path, size):
+    save_model(tmp_path / "m.h5", model)
+    whole = (tmp_path / "m.h5").read_bytes()
+    (tmp_path / "m.h5").write_bytes(whole[:size])
+    with pytest.raises(DatasetError, match="damaged"):
+        load_model(tmp_path / "m.h5")
+
+
+def test_a_missing_file_and_other_files_are_named(tmp_path, tiny):
+    with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
+        load_model(tmp_path / "none.h5")
+    shard = next(tiny("airhockey-hit").rglob("*.h5"))
+    with pytest.raises(DatasetError, match="not a model of cnpgen"):
+        load_model(shard)
+    other = tmp_path / "other.h5"
+    other.write_bytes(seal(Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1))
+    with pytest.raises(DatasetError, match="a checkpoint of cnpgen, not a model"):
+        load_model(other)
+
+
+def test_a_newer_format_asks_for_an_upgrade(tmp_path):
+    path = tmp_path / "new.h5"
+    path.write_bytes(seal(Content({}, {}), kind=model_file.KIND, version=99))
+    with pytest.raises(DatasetError, match=r"format version 99.*upgrade"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("change", ["fewer joints", "unknown features", "no description"])
+def test_a_sealed_file_that_does_not_fit_is_an_error_too(model, tmp_path, change):
+    content = model_file.model_content(model)
+    arrays, texts = dict(content.arrays), dict(content.texts)
+    if change == "fewer joints":
+        arrays["path_output_weight"] = arrays["path_output_weight"][:, :50]
+    elif change == "unknown features":
+        texts["description"] = texts["description"].replace("sin_cos", "colours")
+    else:
+        del texts["description"]
+    path = tmp_path / "odd.h5"
+    path.write_bytes(seal(Content(arrays, texts), kind=model_file.KIND, version=1))
+    with pytest.raises(DatasetError, match="does not fit this version"):
+        load_model(path)
+
+
+def test_an_empty_text_and_a_scalar_come_back(tmp_path):
+    path = tmp_path / "x.h5"
+    path.write_bytes(seal(Content({"a": np.array(1.5)}, {"t": ""}), kind="cnpgen-thing", version=1))
+    found = read_sealed(path, kind="cnpgen-thing", version=1)
+    assert found.texts == {"t": ""}
+    assert found.arrays["a"] == 1.5
+
+
+def test_shipped_models_are_found_by_name_and_others_by_path(tmp_path, monkeypatch):
+    monkeypatch.setattr(model_file, "shipped_models", lambda: {"airhockey-hit": Path("/somewhere/airhockey-hit.h5")})
+    assert find_model("airhockey-hit") == Path("/somewhere/airhockey-hit.h5")
+    assert find_model("mine.h5") == Path("mine.h5")
+    assert find_model(tmp_path / "mine") == tmp_path / "mine"
+    with pytest.raises(UsageError, match=r"unknown model 'airhockey-hot' \(did you mean 'airhockey-hit'\?\)"):
+        find_model("airhockey-hot")
+
+
+@pytest.mark.parametrize("path", model_file.shipped_models().values(), ids=lambda path: path.stem)
+def test_every_shipped_model_is_small_whole_and_says_how_it_was_made(path):
+    assert path.stat().st_size <= 3e6
+    model = load_model(path)
+    assert model.training["command"].startswith("cnpgen train")
+    assert model.training["score"]["plans"] >= 1000
+    assert model.log.count("\n") > 50
+
+
+def test_no_error_is_a_traceback(tmp_path):
+    (tmp_path / "m.h5").write_bytes(b"cnpgen-model 1\nsha256 " + b"0" * 64 + b"\n" + bytes(600))
+    with pytest.raises(CnpgenError):
+        load_model(tmp_path / "m.h5")

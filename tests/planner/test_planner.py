@@ -1,0 +1,197 @@
+"""The planner: boundary conditions to rounding, one or many, replanning without a jump, errors that say why."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.planner.planner import Planner, states_at
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.status import PlanStatus
+from cnpgen.trajectory.boundary import Boundary
+from tests.conftest import columns_of
+from tests.examples.models import boundary_of_columns, untrained_model
+
+
+@pytest.fixture(scope="module")
+def rows(tiny) -> Boundary:
+    return boundary_of_columns(columns_of(tiny("airhockey-replan")), 40)
+
+
+@pytest.fixture(scope="module")
+def planner(rows) -> Planner:
+    return Planner(untrained_model("airhockey", rows))
+
+
+def planned(planner: Planner, rows: Boundary):
+    return planner.plan(rows.start_q, rows.start_dq, rows.start_ddq, goal_q=rows.goal_q, goal_dq=rows.goal_dq)
+
+
+def test_plans_meet_their_boundary_conditions_by_the_independent_verdict(planner, rows):
+    verdicts = evaluate_plans(planned(planner, rows), workers=1).verdicts
+    for verdict in verdicts:
+        for name in ("boundary position", "boundary velocity", "boundary acceleration"):
+            assert verdict.margins[name].excess < 1e-9
+
+
+def test_one_plan_is_the_same_alone_and_among_others(planner, rows):
+    many = planned(planner, rows)
+    assert len(many) == 40
+    assert (many.status == PlanStatus.UNKNOWN).all()
+    for i in (0, 7, 39):
+        one = planner.plan(
+            rows.start_q[i], rows.start_dq[i], rows.start_ddq[i], goal_q=rows.goal_q[i], goal_dq=rows.goal_dq[i]
+        )
+        assert len(one) == 1
+        np.testing.assert_allclose(one.path_control_points[0], many.path_control_points[i], atol=1e-5)
+        np.testing.assert_allclose(one.rate_control_points[0], many.rate_control_points[i], rtol=1e-5)
+
+
+def test_what_is_left_out_is_at_rest(planner, rows):
+    given = planner.plan(rows.start_q[0], goal_q=rows.goal_q[0])
+    np.testing.assert_array_equal(given.boundary.start_dq, 0)
+    np.testing.assert_array_equal(given.boundary.goal_dq, 0)
+    q, dq, ddq = states_at(given, 0.0)
+    np.testing.assert_allclose(q[0], rows.start_q[0], atol=1e-12)
+    np.testing.assert_allclose(dq[0], 0, atol=1e-12)
+    np.testing.assert_allclose(ddq[0], 0, atol=1e-9)
+
+
+def test_tip_positions_are_those_of_pinocchio(planner, rows):
+    plans = planned(planner, rows)
+    for end, q in (("start", rows.start_q), ("goal", rows.goal_q)):
+        np.testing.assert_allclose(plans.columns[f"{end}_xyz"], plans.problem.tip_positions(q), atol=1e-12)
+
+
+def test_replanning_goes_on_without_a_jump_in_position_velocity_or_acceleration(planner, rows):
+    old = planned(planner, rows)
+    when = 0.4 * old.duration
+    new = planner.replan(old, when, goal_q=rows.goal_q[::-1], goal_dq=rows.goal_dq[::-1])
+    before, after = states_at(old, when), states_at(new, 0.0)
+    for found, expected, scale in zip(after, before, (1, 1, 100), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-11 * scale)
+    assert (np.abs(before[1]).max(axis=1) > 0.05).all()  # it was moving
+    np.testing.assert_array_equal(new.boundary.goal_q, rows.goal_q[::-1])
+    arrived = states_at(new, new.duration)
+    np.testing.assert_allclose(arrived[0], rows.goal_q[::-1], atol=1e-9)
+    np.testing.assert_allclose(arrived[1], rows.goal_dq[::-1], atol=1e-8)
+
+
+def test_a_feint_and_then_a_strike_is_one_continuous_motion(planner, rows):
+    """Sampled across both switches, velocities and accelerations are no further apart than a step of time explains."""
+    feint = planner.plan(rows.start_q[0], goal_q=rows.goal_q[1])
+    second = planner.replan(feint, 0.5 * feint.duration, goal_q=rows.goal_q[2])
+    strike = planner.replan(second, 0.5 * second.duration, goal_q=rows.goal_q[3], goal_dq=rows.goal_dq[3])
+    h = 1e-6
+    for old, new in ((feint, second), (second, strike)):
+        switch = 0.5 * old.duration[0]
+        q0, dq0, ddq0 = states_at(old, switch - h)
+        q1, dq1, ddq1 = states_at(new, h)
+        np.testing.assert_allclose((q1 - q0) / (2 * h), (dq0 + dq1) / 2, atol=1e-4)
+        np.testing.assert_allclose((dq1 - dq0) / (2 * h), (ddq0 + ddq1) / 2, atol=1e-2)
+
+
+def test_the_order_of_the_paper_is_that_of_positional_arguments(planner, rows):
+    ends = (rows.start_q, rows.start_dq, rows.start_ddq, rows.goal_q, rows.goal_dq)
+    np.testing.assert_array_equal(planner.plan(*ends).path_control_points, planned(planner, rows).path_control_points)
+    with pytest.raises(UsageError, match="goal_q is missing"):
+        planner.plan(rows.start_q)
+
+
+def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(tiny):
+    """A plan's own start and end are off zero by 1e-14: replan(plan, 0) and chains of plans must not fail by it."""
+    rest = boundary_of_columns(columns_of(tiny("heavy-object")), 20)
+    planner = Planner(untrained_model("heavy-object", rest))
+    plans = planned(planner, rest)
+    assert np.abs(states_at(plans, 0.0)[2]).max() > 0
+    again = planner.replan(plans, 0.0, goal_q=rest.goal_q)
+    np.testing.assert_array_equal(again.boundary.start_ddq, 0.0)
+    np.testing.assert_allclose(again.path_control_points, plans.path_control_points, atol=1e-5)
+    limit = planner.robot.velocity_limit
+    planner.plan(rest.start_q, 0.9e-9 * limit, goal_q=rest.goal_q)
+    with pytest.raises(UsageError, match="start_dq was zero"):
+        planner.plan(rest.start_q, 1.1e-9 * limit, goal_q=rest.goal_q)
+    q, dq, _ = states_at(plans, plans.duration)
+    np.testing.assert_allclose(planner.plan(q, dq, goal_q=rest.start_q).boundary.start_dq, 0.0, atol=0)
+
+
+def test_a_planner_goes_to_other_processes_without_its_kernels(planner, rows):
+    other = pickle.loads(pickle.dumps(Planner(planner.model, slow_down=False, backend="numpy")))
+    found = planned(other, rows).path_control_points
+    np.testing.assert_allclose(found, planned(planner, rows).path_control_points, atol=1e-5)
+
+
+def test_planners_models_and_plans_say_in_a_line_what_they_are(planner, rows):
+    size = f"{planner.model.architecture.layers} x {planner.model.architecture.hidden}"
+    assert repr(planner) == f"<Planner for 'airhockey': a network of {size}>"
+    assert repr(planner.model) == f"<Model of 'airhockey': a network of {size}>"
+    plans = planned(planner, rows)
+    assert repr(plans) == "<40 plans of 'airhockey': 40 unknown>"
+    status = np.array([1, 1, 2], np.uint8)
+    assert repr(replace(plans.select(slice(0, 3)), status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
+    assert repr(plans.select(slice(0, 0))) == "<0 plans of 'airhockey'>"
+
+
+@pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
+def test_what_is_no_model_is_refused_by_its_value(wrong):
+    with pytest.raises(UsageError, match=f"a model is a name or a path, got {wrong!r}"):
+        Planner(wrong)
+
+
+@pytest.mark.parametrize("time", [[0.1, 0.2], "soon", [[0.1]] * 3])
+def test_times_that_are_not_one_for_every_plan_are_refused(planner, rows, time):
+    one = planned(planner, rows[:1])
+    with pytest.raises(UsageError, match="time must be one number or one for each of 1 plans, got"):
+        planner.replan(one, time, goal_q=rows.goal_q[0])
+
+
+def test_a_moment_outside_of_the_plan_is_refused(planner, rows):
+    plans = planned(planner, rows)
+    with pytest.raises(UsageError, match=r"plan 0 lasts from 0 to .* cannot be evaluated at -0.1 s"):
+        planner.replan(plans, -0.1, goal_q=rows.goal_q)
+    with pytest.raises(UsageError, match="cannot be evaluated at 100 s"):
+        states_at(plans, 100.0)
+
+
+def test_a_model_of_motions_from_rest_refuses_moving_starts(tiny, rows):
+    resting = boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
+    planner = Planner(untrained_model("airhockey", resting))
+    with pytest.raises(
+        UsageError, match=r"start_dq was zero in every row that the model was trained on, got .* in plan"
+    ):
+        planned(planner, rows)
+    assert len(planned(planner, resting)) == 20
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"goal_q": np.zeros(5)}, r"goal_q must have shape \(6,\) or \(N, 6\), got \(5,\)"),
+        ({"goal_q": np.full(6, np.nan)}, "goal_q must be finite, got .* in row 0"),
+        ({"goal_q": ["a"] * 6}, "goal_q must be an array of numbers"),
+        ({"goal_q": np.zeros((3, 6)), "start_dq": np.zeros((2, 6))}, "start_dq has 2 rows, another .* has 3"),
+    ],
+)
+def test_boundary_conditions_that_cannot_be_meant_are_refused_by_name(planner, wrong, message):
+    arguments = {"start_q": np.zeros(6), "goal_q": np.ones(6), **wrong}
+    with pytest.raises(UsageError, match=message):
+        planner.plan(**arguments)
+
+
+def test_goal_accelerations_are_refused(planner, rows):
+    with pytest.raises(UsageError, match="goal_ddq must be None"):
+        planner.plan_batch(replace(rows, goal_ddq=np.zeros_like(rows.goal_q)))
+
+
+def test_no_tasks_are_no_plans(planner, rows):
+    assert len(planner.plan_batch(rows[:0])) == 0
+
+
+@pytest.mark.parametrize("backend", ["numpy", "casadi"])
+def test_plans_are_the_same_on_every_backend(planner, rows, backend):
+    other = Planner(planner.model, backend=backend)
+    np.testing.assert_allclose(
+        planned(other, rows).path_control_points, planned(planner, rows).path_control_points, atol=1e-5
+    )

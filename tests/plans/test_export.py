@@ -1,0 +1,229 @@
+"""Exported plans: what robots and simulators read is the plan, up to its last instant."""
+
+import csv
+import errno
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.plans import Plans
+from cnpgen.plans.export import FORMS, Exported, export_plans
+from cnpgen.plans.formats import sample_plan
+from cnpgen.trajectory.motion import Motion
+from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
+
+FIELDS = ("q", "dq", "ddq", "jerk")
+JOINTS = list(AIRHOCKEY.robot.joints)
+
+
+def read(exported: Exported, form: str) -> dict[int, dict[str, np.ndarray]]:
+    """Read what was exported, by the index of the plan."""
+    if form == "npz":
+        with np.load(exported.files[0]) as data:
+            assert data["joint_names"].tolist() == JOINTS
+            names = ("t", *FIELDS)
+            return {
+                index: {name: data[f"plan_{index:05d}_{name}"] for name in names} for index in data["plan"].tolist()
+            }
+    return {
+        int(path.stem.removeprefix("plan_")): (read_csv if form == "csv" else read_message)(path)
+        for path in exported.files
+    }
+
+
+def read_csv(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    units = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}
+    assert header == ["t [s]", *(f"{name} {joint} [{unit}]" for name, unit in units.items() for joint in JOINTS)]
+    values = np.array(rows, float)
+    return {"t": values[:, 0]} | {name: values[:, 1 + 6 * i : 7 + 6 * i] for i, name in enumerate(FIELDS)}
+
+
+def read_message(path: Path) -> dict[str, np.ndarray]:
+    message = json.loads(path.read_text(encoding="utf-8"))
+    assert set(message) == {"header", "joint_names", "points"}
+    assert message["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    assert message["joint_names"] == JOINTS
+    stamps = [point["time_from_start"] for point in message["points"]]
+    assert all(set(stamp) == {"sec", "nanosec"} and 0 <= stamp["nanosec"] < 10**9 for stamp in stamps)
+    nanoseconds = np.array([stamp["sec"] * 10**9 + stamp["nanosec"] for stamp in stamps])
+    assert np.all(np.diff(nanoseconds) > 0)
+    names = {"q": "positions", "dq": "velocities", "ddq": "accelerations"}
+    return {"t": nanoseconds / 1e9} | {
+        name: np.array([point[key] for point in message["points"]]) for name, key in names.items()
+    }
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("rate", [1000.0, 30.0, 0.1])
+def test_every_form_holds_the_plans_as_they_are(tmp_path: Path, form: Any, rate: float) -> None:
+    plans = draw_plans(sample_id=np.arange(7) + 40)
+    exported = export_plans(plans, tmp_path / "out", to=form, rate=rate)
+    assert exported.count == 7
+    assert exported.refused == {}
+    found = read(exported, form)
+    assert list(found) == list(range(7))
+    for index, values in found.items():
+        t, T = values["t"], plans.duration[index]
+        stamp = 0.5e-9 if form == "joint-trajectory" else 0.0
+        assert t[0] == 0
+        assert abs(t[-1] - T) <= stamp + 1e-15 * T
+        assert np.all(np.diff(t) > 0)
+        assert np.allclose(t[:-1], np.arange(len(t) - 1) / rate, atol=1e-9)
+        assert 0.009 / rate < t[-1] - t[-2] < 1.0101 / rate
+        motion = plans.select(np.array([index])).motion
+        states = motion.at(motion.phase_at(t[None]))
+        for name in values.keys() - {"t"}:
+            expected = getattr(states, name)[0]
+            assert np.abs(values[name] - expected).max() <= (1e-6 if stamp else 1e-12) * np.abs(expected).max(), name
+        assert np.abs(values["q"][-1] - plans.boundary.goal_q[index]).max() < 1e-12
+        assert np.abs(values["dq"][-1] - plans.boundary.goal_dq[index]).max() < 1e-9
+
+
+def test_npz_says_which_plans_and_samples_there_are(tmp_path: Path) -> None:
+    plans = replace(garbage(), sample_id=np.arange(10) * 11)
+    exported = export_plans(plans, tmp_path, to="npz")
+    assert exported.files == (tmp_path / "plans.npz",)
+    with np.load(exported.files[0]) as data:
+        assert data["plan"].tolist() == [0, 9]
+        assert data["sample_id"].tolist() == [0, 99]
+        assert len(data.files) == 3 + 2 * 5
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_chosen_plans_keep_their_numbers(tmp_path: Path, form: Any) -> None:
+    plans = draw_plans()
+    every = read(export_plans(plans, tmp_path / "all", to=form, rate=50), form)
+    some = read(export_plans(plans, tmp_path / "some", to=form, rate=50, only=[5, 2, 5]), form)
+    assert list(some) == [2, 5]
+    for index, values in some.items():
+        for name, numbers in values.items():
+            assert np.array_equal(numbers, every[index][name])
+
+
+def test_of_the_plans_that_are_not_chosen_nothing_is_said(tmp_path: Path) -> None:
+    exported = export_plans(garbage(), tmp_path, to="csv", rate=50, only=[0, 4])
+    assert exported.count == 1
+    assert list(exported.refused) == [4]
+    for missing in (10, -1):
+        with pytest.raises(UsageError, match=f"there is no plan {missing}: 10 plans are numbered from 0"):
+            export_plans(garbage(), tmp_path, to="csv", only=[missing])
+
+
+def test_numbers_in_a_message_are_numbers_to_readers_of_yaml_1_1(tmp_path: Path) -> None:
+    """PyYAML's own expressions for floats and integers: what fits neither is a text to it."""
+    is_float = re.compile(r"[-+]?(?:[0-9][0-9_]*)\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?")
+    is_integer = re.compile(r"[-+]?(?:0|[1-9][0-9_]*)")
+    plans = draw_plans(n=2)
+    plans = replace(plans, path_control_points=plans.path_control_points * 1e-7)
+    plans.path_control_points[0, :4] = 1e-5  # a single digit before the exponent
+    exported = export_plans(plans, tmp_path, to="joint-trajectory", rate=200)
+    for path in exported.files:
+        text = path.read_text(encoding="utf-8")
+        assert "e-" in text
+        for number in re.findall(r"[-+.eE0-9]*[0-9][-+.eE0-9]*", text.partition('"points"')[2]):
+            assert is_float.fullmatch(number) or is_integer.fullmatch(number), number
+        values = read_message(path)
+        index = int(path.stem[-5:])
+        sampled = sample_plan(plans.motion[[index]], 200)
+        for name in ("q", "dq", "ddq"):
+            assert np.array_equal(values[name], getattr(sampled, name))
+
+
+def test_the_last_sample_is_neither_missing_nor_doubled() -> None:
+    for duration in (0.5, 0.5 + 1e-12, 0.5 - 1e-12, 0.4999, 0.500009, 0.500011, 1e-5, 0.001):
+        motion = Motion(np.zeros((1, 15, 1)), np.full((1, 20), 1 / duration))
+        sampled = sample_plan(motion, 1000.0)
+        assert sampled.t[-1] == motion.duration()[0]
+        steps = np.diff(sampled.t)
+        assert steps.min() > 0.99e-5
+        assert steps.max() < 1.011e-3
+        assert len(sampled.q) == len(sampled.t) >= 2
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_equal_plans_are_equal_bytes(tmp_path: Path, form: Any) -> None:
+    one, two = (export_plans(draw_plans(), tmp_path / name, to=form, rate=50) for name in ("a", "b"))
+    assert [path.read_bytes() for path in one.files] == [path.read_bytes() for path in two.files]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_plans_that_cannot_be_sampled_are_refused_by_name_and_the_others_are_exported(
+    tmp_path: Path, form: Any
+) -> None:
+    plans = garbage()
+    exported = export_plans(plans, tmp_path / "out", to=form, rate=100)
+    assert exported.count == 2
+    assert list(exported.refused) == list(range(1, 9))
+    assert "plan 4 (sample 4): the rate ds/dt is not positive throughout" in exported.refused[4]
+    assert "plan 1 (sample 1): a boundary condition or a control point is not a finite number" in exported.refused[1]
+    found = read(exported, form)
+    assert list(found) == [0, 9]
+    clean = read(export_plans(draw_plans(n=10), tmp_path / "clean", to=form, rate=100), form)
+    for index in (0, 9):
+        for name, values in found[index].items():
+            assert np.array_equal(values, clean[index][name])
+
+
+def with_duration(plans: Plans, durations: list[float]) -> Plans:
+    rate = plans.rate_control_points.copy()
+    for index, duration in enumerate(durations):
+        rate[index] *= plans.duration[index] / duration
+    return replace(plans, rate_control_points=rate)
+
+
+def test_plans_of_a_million_samples_or_less_than_a_nanosecond_are_refused(tmp_path: Path) -> None:
+    plans = with_duration(draw_plans(n=5), [1001.0, 1e300, 1e-10, 0.5, 2.0])
+    plans.path_control_points[4, 5] = 1e306
+    exported = export_plans(plans, tmp_path, to="csv", rate=1000)
+    assert [path.name for path in exported.files] == ["plan_00003.csv"]
+    assert "it lasts 1e+03 s: more than 1000000 samples at 1000 Hz" in exported.refused[0]
+    assert "more than 1000000 samples" in exported.refused[1]
+    assert "it lasts 1e-10 s, less than a nanosecond" in exported.refused[2]
+    assert "too large to compute with" in exported.refused[4]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_if_no_plan_can_be_exported_nothing_is_written(tmp_path: Path, form: Any) -> None:
+    bad = garbage().select(np.arange(1, 9))
+    with pytest.raises(DatasetError, match=r"none of the 8 plans can be exported: plan 0 \(sample 1\): a boundary"):
+        export_plans(bad, tmp_path / "out", to=form)
+    with pytest.raises(DatasetError, match=r"none of the 0 plans can be exported$"):
+        export_plans(bad.select(np.zeros(8, bool)), tmp_path / "out", to=form)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf, 2e6])
+def test_a_rate_that_makes_no_sense_is_refused(tmp_path: Path, rate: float) -> None:
+    with pytest.raises(UsageError, match=r"the rate must be above 0 and at most 1e\+06 Hz, got"):
+        export_plans(draw_plans(), tmp_path, to="csv", rate=rate)
+
+
+def test_wrong_forms_and_places_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plans = draw_plans()
+    with pytest.raises(UsageError, match="can be exported to npz, csv, joint-trajectory, got 'yaml'"):
+        export_plans(plans, tmp_path, to="yaml")  # type: ignore[arg-type]
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UsageError, match="file is a file, but 'csv' makes one file per plan: give a folder"):
+        export_plans(plans, tmp_path / "file", to="csv")
+
+    def full(*_arguments: object, **_options: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    for form in FORMS:
+        with pytest.raises(MachineError, match="No space left"):
+            export_plans(plans, tmp_path / f"full-{form}", to=form)
+
+
+def test_the_highest_rate_still_has_different_stamps(tmp_path: Path) -> None:
+    plans = with_duration(draw_plans(n=1), [0.00100049])
+    exported = export_plans(plans, tmp_path, to="joint-trajectory", rate=1e6)
+    assert len(read_message(exported.files[0])["t"]) in {1001, 1002}

@@ -1,0 +1,142 @@
+"""Pictures of plans: what is drawn is the plan, in every format, and what cannot be drawn is told."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.plans.plot import plot_plan
+from tests.examples.plans import Plan, bent, course, load
+
+
+def draw(plan: Plan, path: Path, index: int = 0) -> None:
+    plot_plan(plan.problem, plan.robot, plan.motion, index, path)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
+    """The figures that would have been saved."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.append(self))
+    return figures
+
+
+def axes_of(figure: Figure) -> dict[str, Any]:
+    """Axes by the label of their y axis or their title."""
+    axes = [axis for part in figure.subfigs for axis in part.axes]
+    return {axis.get_title() or axis.get_ylabel(): axis for axis in axes}
+
+
+@pytest.mark.parametrize("label", ["hit", "transport"])
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_a_plan_is_drawn(label, suffix, tmp_path):
+    draw(load(label), tmp_path / f"plan.{suffix}")
+    assert (tmp_path / f"plan.{suffix}").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("label", ["hit", "replan", "transport"])
+def test_joints_are_drawn_as_shares_of_their_limits_over_time(label, drawn):
+    plan = load(label)
+    draw(plan, Path("plan.png"))
+    axes, seen = axes_of(drawn[0]), course(plan, 2001)
+    shares = {
+        "velocity": seen.dq / plan.robot.velocity_limit,
+        "acceleration": seen.ddq / plan.robot.acceleration_limit,
+        "torque": seen.tau / plan.robot.torque_limit,
+    }
+    for name, share in shares.items():
+        lines = axes[f"{name} [% of limit]"].get_lines()
+        for line, values, joint in zip(lines, share.T, plan.robot.joint_names, strict=False):
+            assert line.get_label() == joint
+            expected = np.interp(line.get_xdata(), seen.t, values)
+            np.testing.assert_allclose(line.get_ydata(), 100 * expected, atol=0.5)
+    position = np.array([line.get_ydata() for line in axes["position [% of limit]"].get_lines()[: plan.robot.n]])
+    middle, half = (
+        plan.robot.position_upper + plan.robot.position_lower,
+        plan.robot.position_upper - plan.robot.position_lower,
+    )
+    np.testing.assert_allclose(position[:, 0], 100 * (2 * seen.q[0] - middle) / half, atol=1e-9)
+
+
+def test_the_tip_is_drawn_over_the_table_with_the_height_that_is_called_valid(drawn):
+    plan = load("hit")
+    draw(plan, Path("plan.png"))
+    axes, seen = axes_of(drawn[0]), course(plan, 2001)
+    above, beside = axes["tip over the table, dots 20 ms apart"], axes["z above the table [mm]"]
+    assert above.patches[0].get_bbox().bounds == pytest.approx((0.6, -0.45, 1.4, 0.9))
+    x, y = above.get_lines()[0].get_data()
+    np.testing.assert_allclose([x[-1], y[-1]], seen.tip[-1, :2], atol=1e-9)
+    t, z = beside.get_lines()[0].get_data()
+    np.testing.assert_allclose(z, 1e3 * (np.interp(t, seen.t, seen.tip[:, 2]) - 0.16), atol=1e-3)
+    low, high = beside.collections[0].get_datalim(beside.transData).intervaly
+    assert high == -low == pytest.approx(1 + 1e3 * abs(seen.tip[0, 2] - 0.16))
+
+
+def test_a_transport_is_drawn_from_the_side_and_from_above(drawn):
+    plan = load("transport")
+    draw(plan, Path("plan.png"))
+    axes, seen = axes_of(drawn[0]), course(plan, 2001)
+    tops = [plan.start_xyz[0, 2] - 0.15, plan.goal_xyz[0, 2] - 0.15]
+    assert [patch.get_bbox().y1 for patch in axes["side view"].patches] == pytest.approx(tops)
+    assert [patch.get_bbox().bounds for patch in axes["top view"].patches] == [
+        pytest.approx((-0.6, 0.2, 0.3, 0.4)),
+        pytest.approx((0.3, 0.2, 0.3, 0.4)),
+    ]
+    for view, (across, up) in (("side view", (1, 2)), ("top view", (1, 0))):
+        goal = next(line for line in axes[view].get_lines() if line.get_label() == "goal")
+        np.testing.assert_allclose(np.ravel(goal.get_data()), seen.tip[-1, [across, up]], atol=1e-9)
+
+
+def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_is_told(drawn):
+    plan = load("transport")
+    plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), tops=np.array([0.1, 0.2]), note="not valid")
+    assert [patch.get_bbox().y1 for patch in axes_of(drawn[0])["side view"].patches] == pytest.approx([0.1, 0.2])
+    assert drawn[0].get_suptitle() == f"heavy-object, plan 0: {plan.motion.duration()[0]:.3f} s\nnot valid"
+
+
+@pytest.mark.parametrize("label", ["hit", "transport"])
+@pytest.mark.parametrize("by", [1.0, 1e3, 1e150])
+def test_a_plan_beyond_its_limits_is_drawn_too(label, by, tmp_path):
+    draw(bent(load(label), by), tmp_path / "plan.png")
+
+
+def test_a_plan_that_goes_nowhere_is_drawn(tmp_path):
+    plan = load("transport")
+    draw(plan.changed(path=0 * plan.motion.path), tmp_path / "plan.png")
+
+
+def test_a_problem_without_a_table_and_obstacles_is_drawn(tmp_path):
+    plan = load("hit")
+    problem = replace(plan.problem, constraint=plan.problem.constraint[:4])
+    draw(replace(plan, problem=problem), tmp_path / "plan.png")
+
+
+@pytest.mark.parametrize("index", [-1, 1])
+def test_there_must_be_such_a_plan(index, tmp_path):
+    with pytest.raises(UsageError, match=f"no plan {index}, expected 0 to 0"):
+        draw(load("hit"), tmp_path / "plan.png", index)
+
+
+def test_a_plan_without_a_course_is_told(tmp_path):
+    plan = load("hit")
+    with pytest.raises(UsageError, match="not positive"):
+        draw(plan.changed(rate=-plan.motion.rate), tmp_path / "plan.png")
+    with pytest.raises(UsageError, match="not finite"):
+        draw(plan.changed(path=plan.motion.path * np.nan), tmp_path / "plan.png")
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(MachineError, match="cannot write"):
+        draw(load("hit"), tmp_path / "missing" / "plan.png")
+
+
+def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MachineError, match=r"cnpgen\[plot\]"):
+        draw(load("hit"), tmp_path / "plan.png")

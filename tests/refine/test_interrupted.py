@@ -1,0 +1,106 @@
+"""Refining that is cut off by a killed worker or a full disk: nothing finished is lost, and the next run goes on."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cnpgen.cli.main import main
+from cnpgen.errors import MachineError
+from cnpgen.make.problems import draw_problems
+from cnpgen.plans import load_plans, save_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.refine.plans import refine_plans
+from tests.cli.test_interruption import descendants
+from tests.refine.test_plans import same
+
+N = 14
+linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
+
+
+@pytest.fixture(scope="module")
+def problems() -> Plans:
+    return draw_problems("airhockey-hit", N, seed=6)
+
+
+@pytest.fixture(scope="module")
+def solved(problems: Plans) -> Plans:
+    return refine_plans(problems, workers=1).plans
+
+
+def kill_workers(_plans: int, _valid: int) -> None:
+    names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in descendants(os.getpid())}
+    for pid, name in names.items():
+        if "popen_loky" in name:
+            os.kill(pid, signal.SIGKILL)
+
+
+@linux
+def test_what_was_finished_before_a_worker_was_killed_is_not_made_again(
+    problems: Plans, solved: Plans, tmp_path: Path
+) -> None:
+    journal, begun = tmp_path / "journal", []
+    with pytest.raises(MachineError, match=r"a worker died .*journal holds what is finished; run the same command"):
+        refine_plans(problems, workers=2, journal=journal, progress=kill_workers)
+    found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
+    ((total, there),) = begun
+    assert total == N
+    assert 1 <= there < N
+    assert same(found.plans, solved)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_disk_that_is_full_is_told_with_what_to_do_and_what_fits_counts(
+    problems: Plans, solved: Plans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    journal, flush, calls, begun = tmp_path / "journal", os.fsync, [], []
+
+    def full(descriptor: int) -> None:
+        calls.append(descriptor)
+        if len(calls) > 5:
+            raise OSError(number, os.strerror(number))
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(MachineError, match=rf"cannot write {journal}: {os.strerror(number)}; .*run the same command"):
+        refine_plans(problems, workers=1, journal=journal)
+    monkeypatch.undo()
+    found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
+    assert begun[0][1] >= 4
+    assert same(found.plans, solved)
+
+
+LIMITED = """
+import resource, sys
+from cnpgen.cli.main import main
+
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+    sys.exit(main(sys.argv[2:]))
+"""
+
+
+@linux
+@pytest.mark.parametrize(("limit", "workers"), [(12_000, "2"), (30_000, "1")])
+def test_a_file_that_cannot_grow_is_one_line_and_the_same_command_goes_on(
+    problems: Plans, solved: Plans, tmp_path: Path, limit: int, workers: str
+) -> None:
+    """The smaller limit stops the journal in the middle of a plan, the larger one the file of plans at the end."""
+    given, out = tmp_path / "problems.h5", tmp_path / "out.h5"
+    save_plans(given, problems)
+    words = ["refine", str(given), "-o", str(out), "--workers", workers]
+    command = [sys.executable, "-c", LIMITED, str(limit), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (3, "")
+    begun, error = done.stderr.splitlines()
+    assert begun == f"refining {given}: {N} plans"
+    file = "out.h5.part" if limit < 20_000 else "out.h5"
+    assert error.startswith(f"cnpgen: error: cannot write {tmp_path / file}: File too large; ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.h5.part", "problems.h5"]
+    assert main([*words, "--quiet"]) == 0
+    assert same(load_plans(out), solved)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.h5", "problems.h5"]

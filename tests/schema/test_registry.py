@@ -1,0 +1,158 @@
+"""The registry of stages and constraints."""
+
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, EntryPoints
+
+import pytest
+
+from cnpgen.errors import RecipeError
+from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.schema import registry
+from cnpgen.schema.keys import field
+from cnpgen.schema.registry import CONSTRAINTS, STAGES, load, name_of, names
+from tests.examples.stages import Idle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roll(Idle):
+    sides: int = field("sides of the die", default=6)
+
+
+class NotADataclass(Roll):
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Abstract(Stage):
+    def describe(self):
+        return "abstract"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undeclared(Roll):
+    loaded: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toss(Roll):
+    pass
+
+
+THE_STRING = "not a class"
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Return a function that installs entry points (group, name, value)."""
+    entries: list[EntryPoint] = []
+
+    def fake(*, group):
+        return EntryPoints(entry for entry in entries if entry.group == group)
+
+    def add(group, name, value):
+        entries.append(EntryPoint(name=name, value=value, group=group))
+        registry.installed.cache_clear()
+
+    monkeypatch.setattr("importlib.metadata.entry_points", fake)
+    monkeypatch.setattr(registry, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}})
+    registry.installed.cache_clear()
+    yield add
+    registry.installed.cache_clear()
+
+
+def test_a_built_in_kind_is_imported_by_name(register):
+    assert load(STAGES, "roll") is Roll
+    assert names(STAGES) == ("roll",)
+
+
+def test_an_entry_point_adds_a_kind(register):
+    register(STAGES, "toss", f"{__name__}:Toss")
+    assert load(STAGES, "toss") is Toss
+    assert names(STAGES) == ("roll", "toss")
+    assert names(CONSTRAINTS) == ()
+
+
+def test_an_unknown_kind_names_the_nearest_and_all_known_ones(register):
+    register(STAGES, "toss", f"{__name__}:Toss")
+    with pytest.raises(RecipeError, match=r"unknown stage 'rol' \(did you mean 'roll'\?\); known: roll, toss"):
+        load(STAGES, "rol")
+
+
+def test_a_kind_of_the_other_group_is_unknown(register):
+    with pytest.raises(RecipeError, match="unknown constraint 'roll'"):
+        load(CONSTRAINTS, "roll")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("no_such_module_of_anyone:Stage", "ModuleNotFoundError"),
+        (f"{__name__}:Missing", "AttributeError"),
+        (f"{__name__}:THE_STRING", "is not a subclass of cnpgen.pipelines.stages.stage.Stage, got 'not a class'"),
+        ("builtins:dict", "is not a subclass of cnpgen.pipelines.stages.stage.Stage"),
+        (f"{__name__}:Abstract", "Abstract is abstract, it does not define prepare, provides"),
+        (f"{__name__}:NotADataclass", "NotADataclass is not a dataclass"),
+        (f"{__name__}:Undeclared", "the field 'loaded' is not declared with cnpgen.plugins.field"),
+    ],
+)
+def test_a_broken_plug_in_is_a_recipe_error(register, value, message):
+    register(STAGES, "broken", value)
+    with pytest.raises(RecipeError, match="stage 'broken'") as caught:
+        load(STAGES, "broken")
+    assert message in str(caught.value)
+    assert load(STAGES, "roll") is Roll
+
+
+def test_a_module_that_raises_while_it_is_imported_is_a_recipe_error(register, tmp_path, monkeypatch):
+    (tmp_path / "plugin_that_divides.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    register(STAGES, "divide", "plugin_that_divides:Stage")
+    with pytest.raises(RecipeError, match="ZeroDivisionError"):
+        load(STAGES, "divide")
+
+
+def test_a_plug_in_with_the_name_of_a_built_in_kind_is_an_error(register):
+    register(STAGES, "roll", f"{__name__}:Toss")
+    with pytest.raises(RecipeError, match=r"stage 'roll' is defined more than once: by cnpgen and by .*:Toss"):
+        load(STAGES, "roll")
+    assert names(STAGES) == ("roll",)
+
+
+def test_two_plug_ins_with_one_name_are_an_error(register):
+    register(STAGES, "toss", f"{__name__}:Toss")
+    register(STAGES, "toss", f"{__name__}:Roll")
+    with pytest.raises(RecipeError, match="defined more than once"):
+        load(STAGES, "toss")
+
+
+def test_who_lacks_a_plug_in_is_told_which_package_to_install(register):
+    assert registry.why_missing(STAGES, "roll", "") == ""
+    text = registry.why_missing(STAGES, "toss", "dice-stages")
+    assert "stage 'toss' comes from the package 'dice-stages', which is not installed" in text
+    assert "pip install dice-stages" in text
+    assert "entry point group 'cnpgen.constraints'" in registry.why_missing(CONSTRAINTS, "toss", "")
+    register(STAGES, "toss", f"{__name__}:Toss")
+    assert registry.why_missing(STAGES, "toss", "dice-stages") == ""
+
+
+def test_name_of_is_the_inverse_of_load(register):
+    register(STAGES, "broken", f"{__name__}:Missing")
+    register(STAGES, "toss", f"{__name__}:Toss")
+    assert [name_of(STAGES, load(STAGES, name)) for name in ("roll", "toss")] == ["roll", "toss"]
+
+
+def test_name_of_an_unregistered_class_says_where_it_is(register):
+    register(STAGES, "broken", f"{__name__}:Missing")
+    assert name_of(STAGES, Toss) == f"{__name__}:Toss"
+
+
+def test_every_group_has_a_base():
+    assert {group: registry.contract(group) for group in registry.BUILT_IN} == {STAGES: Stage, CONSTRAINTS: Constraint}
+    assert registry.CONTRACTS.keys() == registry.BUILT_IN.keys()
+
+
+@pytest.mark.parametrize("group", registry.CONTRACTS)
+def test_every_built_in_kind_can_be_loaded(group):
+    for name in registry.BUILT_IN[group]:
+        assert name_of(group, load(group, name)) == name

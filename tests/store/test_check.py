@@ -1,0 +1,215 @@
+"""The shallow check: whatever is changed in a dataset is found and named."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import pytest
+
+from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, check_dataset, check_documents
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.files.documents import save_document
+from cnpgen.store.manifest import finalize, load_manifest
+from tests.examples.store import PLAN, dataset, make_shard, make_shards
+
+__all__ = ["dataset"]
+
+TASK = shards(PLAN)[0]
+FILES = [
+    "plan.json",
+    "manifest.json",
+    "stats.json",
+    "README.md",
+    "croissant.json",
+    "train/shard-00000.h5",
+    "train/shard-00001.json",
+    "validation/shard-00000.h5",
+]
+
+
+def problems(folder: Path) -> dict[str, str]:
+    """Return what is wrong, file by file."""
+    return {item.file: item.problem for item in check_dataset(folder) if not item.note}
+
+
+def test_a_good_dataset_has_no_findings_and_every_shard_is_announced(dataset: Path) -> None:
+    announced: list[str] = []
+    assert check_dataset(dataset, progress=announced.append) == []
+    assert announced == [task.file for task in shards(PLAN)]
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("where", [0.0, 0.3, 0.77, 1.0])
+def test_a_flipped_byte_in_any_file_is_found_and_named(dataset: Path, name: str, where: float) -> None:
+    content = bytearray((dataset / name).read_bytes())
+    content[round(where * (len(content) - 1))] ^= 1
+    (dataset / name).write_bytes(content)
+    assert problems(dataset).keys() == {name}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("action", [lambda old: b"", lambda old: old[: len(old) // 2]], ids=["empty", "truncated"])
+def test_empty_and_truncated_files_are_found_and_named(
+    dataset: Path, name: str, action: Callable[[bytes], bytes]
+) -> None:
+    (dataset / name).write_bytes(action((dataset / name).read_bytes()))
+    assert problems(dataset).keys() == {name}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_missing_files_are_found_and_named(dataset: Path, name: str) -> None:
+    (dataset / name).unlink()
+    found = problems(dataset)
+    assert found.keys() == {name}
+    assert "missing" in found[name]
+
+
+def test_a_byte_that_makes_hdf5_hang_is_found(dataset: Path) -> None:
+    """HDF5 2.0 reads texts of a broken heap forever."""
+    content = (dataset / TASK.file).read_bytes()
+    for position in range(content.index(b"GCOL"), len(content), 401):
+        (dataset / TASK.file).write_bytes(content[:position] + b"\xff" + content[position + 1 :])
+        if content[position] != 0xFF:
+            assert problems(dataset).keys() == {TASK.file}
+
+
+def test_a_shard_from_another_seed_is_named_as_such(tmp_path: Path, dataset: Path) -> None:
+    other = tmp_path / "other"
+    make_shards(other, replace(PLAN, seed=5))
+    shutil.copy(other / TASK.file, dataset / TASK.file)
+    message = f"{TASK.file}: its root_seed is '5', the plan says '{PLAN.seed}'"
+    assert message in [str(item) for item in check_dataset(dataset)]
+    shutil.copy(other / TASK.sidecar, dataset / TASK.sidecar)
+    texts = [str(item) for item in check_dataset(dataset)]
+    assert message in texts
+    assert any(text.startswith(f"{TASK.sidecar}: belongs to another plan") for text in texts)
+    assert {item.file for item in check_dataset(dataset)} == {TASK.file, TASK.sidecar}
+    assert {item.advice for item in check_dataset(dataset)} == {MAKE_AGAIN}
+    (dataset / "manifest.json").unlink()
+    assert {item.advice for item in check_dataset(dataset)} == {MAKE_AGAIN}
+
+
+def test_swapped_shards_are_found(dataset: Path) -> None:
+    first, last = dataset / TASK.file, dataset / shards(PLAN)[-1].file
+    content = first.read_bytes()
+    shutil.copy(last, first)
+    last.write_bytes(content)
+    assert problems(dataset).keys() == {TASK.file, shards(PLAN)[-1].file}
+    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    assert any("its split is 'validation', the plan says 'train'" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda file: file["start_q"].attrs.__setitem__("units", "deg"), "field 'start_q' has units 'deg'"),
+        (lambda file: file["start_q"].attrs.__delitem__("valid_max"), "field 'start_q' has valid_max '(nothing)'"),
+        (lambda file: file["start_q"].attrs.__setitem__("offset", 3), "field 'start_q' has offset"),
+        (lambda file: file.move("clearance", "margin"), "lacks the field 'clearance'"),
+        (lambda file: file.move("clearance", "margin"), "has an unknown field 'margin'"),
+        (lambda file: file.attrs.__setitem__("first_sample_id", 3), "its first_sample_id is 3, the plan says 0"),
+    ],
+)
+def test_shards_that_contradict_the_plan_are_found(
+    dataset: Path, change: Callable[[h5py.File], object], message: str
+) -> None:
+    with h5py.File(dataset / TASK.file, "r+") as file:
+        change(file)
+    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    assert problems(dataset).keys() == {TASK.file}
+    assert any(message in text for text in texts)
+
+
+def test_a_shard_with_other_rows_or_types_is_found(dataset: Path) -> None:
+    with h5py.File(dataset / TASK.file, "r+") as file:
+        attributes = dict(file["clearance"].attrs)
+        del file["clearance"]
+        file.create_dataset("clearance", data=[0.0] * 31, dtype="<f4").attrs.update(attributes)
+    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    assert any("'clearance' is float32 of shape (31,), not float64" in text for text in texts)
+
+
+def test_files_that_do_not_belong_to_the_dataset_are_notes(dataset: Path) -> None:
+    for name in ("notes.txt", "train/shard-00002.h5", "_work/x.tmp", "junk/a/b"):
+        (dataset / name).parent.mkdir(parents=True, exist_ok=True)
+        (dataset / name).write_text("")
+    found = check_dataset(dataset)
+    assert {item.file for item in found} == {"notes.txt", "train/shard-00002.h5", "junk"}
+    assert {item.file for item in found if not item.note} == {"train/shard-00002.h5"}  # loaders would read it
+
+
+def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> None:
+    save_plan(tmp_path, PLAN)
+    for task in shards(PLAN)[:2]:
+        make_shard(tmp_path, PLAN, task)
+    message = "is missing: the dataset is unfinished: 2 of 3 shards are there; run the same make-dataset command again"
+    assert check_dataset(tmp_path) == [Finding("manifest.json", message, advice=MAKE_AGAIN)]
+    make_shard(tmp_path, PLAN, shards(PLAN)[2])
+    assert "unfinished: all shards are there, but they were not summed up" in problems(tmp_path)["manifest.json"]
+
+
+def test_damage_to_an_unfinished_dataset_is_found(tmp_path: Path) -> None:
+    make_shards(tmp_path)
+    path = tmp_path / TASK.file
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    (tmp_path / shards(PLAN)[1].sidecar).write_bytes(b"{")
+    assert problems(tmp_path).keys() == {"manifest.json", TASK.file, shards(PLAN)[1].sidecar}
+
+
+def test_a_damaged_manifest_does_not_hide_a_damaged_shard(dataset: Path) -> None:
+    (dataset / "manifest.json").write_text("{")
+    (dataset / TASK.file).unlink()
+    (dataset / shards(PLAN)[1].sidecar).unlink()
+    assert problems(dataset).keys() == {"manifest.json", TASK.file, shards(PLAN)[1].sidecar}
+
+
+def test_manifests_that_contradict_the_plan_or_themselves_are_found(tmp_path: Path, dataset: Path) -> None:
+    good = load_manifest(dataset)
+    cases = [
+        ({"plan_fingerprint": "0" * 64}, "another plan"),
+        ({"fingerprint": "0" * 64}, "its fingerprint is not"),
+        ({"splits": {"train": good["splits"]["train"]}}, "lists other shards"),
+    ]
+    for change, message in cases:
+        save_document(dataset / "manifest.json", good | change)
+        assert message in " ".join(str(item) for item in check_dataset(dataset))
+
+
+def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path) -> None:
+    assert check_dataset(tmp_path) == [Finding("plan.json", "is missing", advice=REPLACE)]
+    assert check_dataset(tmp_path / "nowhere") == [Finding("plan.json", "is missing", advice=REPLACE)]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_finding_says_what_to_do_and_names_its_file_once(dataset: Path, name: str) -> None:
+    for content in (b"", b"{}", None):
+        if content is None:
+            (dataset / name).unlink()
+        else:
+            (dataset / name).write_bytes(content)
+        for item in check_dataset(dataset):
+            assert item.advice
+            assert name not in item.problem
+            assert str(dataset) not in item.problem
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if not name.endswith(".h5") and name != "plan.json"])
+def test_changed_documents_are_found_without_reading_a_shard(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    assert check_documents(dataset, PLAN) == []
+    content = (dataset / name).read_bytes()
+    (dataset / name).write_bytes(content[:-2] + b" " + content[-2:])
+    read = []
+    monkeypatch.setattr("cnpgen.store.check.file_sha256", lambda path: (read.append(path.suffix), file_sha256(path))[1])
+    assert [item.file for item in check_documents(dataset, PLAN)] == [name]
+    assert ".h5" not in read
+
+
+def test_a_dataset_that_is_finished_again_is_good(dataset: Path) -> None:
+    finalize(dataset)
+    assert check_dataset(dataset) == []

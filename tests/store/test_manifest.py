@@ -1,0 +1,216 @@
+"""Finishing a dataset: statistics, card, Croissant and, last, the manifest."""
+
+import contextlib
+import hashlib
+import io
+import json
+import multiprocessing
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.store import manifest as manifest_module
+from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.check import check_dataset
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.manifest import finalize, load_manifest
+from cnpgen.store.record import commit_shard
+from tests.examples.store import FIELDS, PLAN, dataset, make_columns, make_outcome, make_shard, make_shards
+
+__all__ = ["dataset"]
+
+
+def test_the_manifest_says_what_the_dataset_is(dataset: Path) -> None:
+    manifest = load_manifest(dataset)
+    assert manifest["name"] == "two-shards"
+    assert manifest["pipeline"] == "toy"
+    assert manifest["recipe"] == PLAN.recipe
+    assert manifest["seed"] == str(PLAN.seed)
+    assert manifest["plan_fingerprint"] == PLAN.fingerprint
+    assert manifest["features"]["start_q"]["shape"] == [3]
+    assert manifest["features"]["start_q"]["units"] == "rad"
+    assert manifest["features"]["clearance"]["shape"] == []
+    assert manifest["features"]["sample_id"]["dtype"] == "int64"
+    assert manifest["yield"] == {"tried": 120, "accepted": 60, "rejections": {"no IK": 57, "collision": 3}}
+    assert manifest["verification"] == {"plane": 2e-9}
+    assert manifest["splits"]["train"]["rows"] == 50
+    assert manifest["seconds"] == 1.5
+    assert manifest["environments"] == [dict(PLAN.versions)]
+
+
+def test_the_manifest_lists_every_other_file_with_its_digest(dataset: Path) -> None:
+    manifest = load_manifest(dataset)
+    listed = {name: entry["sha256"] for name, entry in manifest["files"].items()}
+    for split in manifest["splits"].values():
+        for entry in split["shards"]:
+            listed |= {entry["file"]: entry["sha256"], entry["sidecar"]["file"]: entry["sidecar"]["sha256"]}
+    found = {path.relative_to(dataset).as_posix() for path in dataset.rglob("*") if path.is_file()}
+    assert found - {"manifest.json"} == listed.keys()
+    assert all(file_sha256(dataset / name) == sha256 for name, sha256 in listed.items())
+
+
+def test_the_fingerprint_is_what_sha256sum_says(dataset: Path) -> None:
+    command = "LC_ALL=C; export LC_ALL; sha256sum */shard-*.h5 | sha256sum"
+    said = subprocess.run(command, shell=True, cwd=dataset, capture_output=True, text=True, check=True).stdout
+    assert load_manifest(dataset)["fingerprint"] == said.split()[0]
+
+
+def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
+    stats = json.loads((dataset / "stats.json").read_text())
+    rows = np.concatenate([make_columns(task)["start_q"] for task in shards(PLAN) if task.split == "train"])
+    found = stats["splits"]["train"]["start_q"]
+    np.testing.assert_allclose(found["mean"], rows.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found["std"], rows.std(axis=0), rtol=1e-12)
+    assert found["count"] == 50
+    assert stats["splits"]["train"]["goal_p"]["constant"] == [False, True]
+    assert stats["splits"]["validation"]["start_q"]["count"] == 10
+    assert stats["densities"]["train"]["goal"]["drawn"] == [[4] * 3] * 4
+
+
+def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
+    before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
+    finalize(dataset, notes="Some notes.")
+    assert {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()} == before
+    assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
+
+
+def test_finishing_in_several_processes_at_once_gives_a_good_dataset(dataset: Path) -> None:
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        manifests = pool.map(finalize, [dataset] * 9)
+    assert check_dataset(dataset) == []
+    assert manifests == [load_manifest(dataset)] * 9
+
+
+def test_records_without_a_start_are_dated_by_the_clock_and_nonsense_is_refused(tmp_path: Path) -> None:
+    plan = replace(PLAN, splits={"train": 10})
+    task = shards(plan)[0]
+    for started, good in (("", True), ("yesterday", False)):
+        folder = tmp_path / str(good)
+        save_plan(folder, plan)
+        commit_shard(folder, plan, task, columns=make_columns(task), outcome=make_outcome(task), started=started)
+        if good:
+            assert finalize(folder)["created"].endswith("Z")
+        else:
+            with pytest.raises(DatasetError, match="yesterday"):
+                finalize(folder)
+
+
+def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1763690000")
+    assert finalize(dataset)["created"] == "2025-11-21T01:53:20Z"
+    first = (dataset / "manifest.json").read_bytes()
+    finalize(dataset)
+    assert (dataset / "manifest.json").read_bytes() == first
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    with pytest.raises(UsageError, match="SOURCE_DATE_EPOCH must be whole seconds since 1970, got 'yesterday'"):
+        finalize(dataset)
+
+
+def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_path: Path) -> None:
+    save_plan(tmp_path, PLAN)
+    make_shard(tmp_path, PLAN, shards(PLAN)[1])
+    with pytest.raises(DatasetError) as caught:
+        finalize(tmp_path)
+    assert "1 of 3 shards are there; run the same make-dataset command again" in str(caught.value)
+    assert "train/shard-00000.json is missing" in str(caught.value)
+    assert "validation/shard-00000.json is missing" in str(caught.value)
+    assert "shard-00001" not in str(caught.value)
+    assert not (tmp_path / "manifest.json").exists()
+
+
+def test_a_long_list_of_missing_shards_is_cut_short(tmp_path: Path) -> None:
+    save_plan(tmp_path, replace(PLAN, splits={"train": 320}))
+    with pytest.raises(DatasetError, match="and 5 more"):
+        finalize(tmp_path)
+
+
+def test_shards_of_another_seed_and_cut_off_shards_are_refused(tmp_path: Path) -> None:
+    make_shards(tmp_path)
+    make_shard(tmp_path, replace(PLAN, seed=1), shards(PLAN)[0])
+    path = tmp_path / shards(PLAN)[1].file
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(
+        DatasetError, match=r"(?s)00000\.json belongs to another plan.*00001\.h5 is not the recorded file"
+    ):
+        finalize(tmp_path)
+
+
+@pytest.mark.parametrize("step", ["save_document", "write_file", "_manifest"])
+def test_a_finalize_that_is_killed_leaves_no_manifest(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    def killed(*_arguments: object, **_options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(manifest_module, step, killed)
+    with pytest.raises(KeyboardInterrupt):
+        finalize(dataset)
+    assert not (dataset / "manifest.json").exists()
+    monkeypatch.undo()
+    finalize(dataset)
+    assert (dataset / "manifest.json").exists()
+
+
+def test_a_full_disk_while_finishing_is_a_machine_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    make_shards(tmp_path)
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(MachineError, match=r"stats\.json"):
+        finalize(tmp_path)
+    assert not (tmp_path / "manifest.json").exists()
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b'{"format": "cnpgen-dataset", "format_version": 1}\n'])
+def test_damaged_manifests_are_refused(dataset: Path, damage: bytes) -> None:
+    (dataset / "manifest.json").write_bytes(damage)
+    with pytest.raises(DatasetError, match=r"manifest\.json is damaged"):
+        load_manifest(dataset)
+
+
+def test_datasets_with_an_empty_split_are_finished_like_any_other(tmp_path: Path) -> None:
+    make_shards(tmp_path, replace(PLAN, splits={"train": 20, "validation": 0}))
+    manifest = finalize(tmp_path)
+    assert manifest["splits"]["validation"]["shards"] == []
+    assert "validation/*.h5" not in (tmp_path / "README.md").read_text()
+
+
+def test_croissant_lists_the_files_and_promises_no_records(dataset: Path) -> None:
+    croissant = json.loads((dataset / "croissant.json").read_text())
+    assert "recordSet" not in croissant
+    assert croissant["license"] == "https://spdx.org/licenses/CC-BY-4.0"
+    assert [item["contentUrl"] for item in croissant["distribution"]] == [task.file for task in shards(PLAN)]
+    for item in croissant["distribution"]:
+        content = (dataset / item["contentUrl"]).read_bytes()
+        assert item["encodingFormat"] == "application/x-hdf5"
+        assert item["contentSize"] == f"{len(content)} B"
+        assert item["sha256"] == hashlib.sha256(content).hexdigest()
+
+
+def test_the_card_says_what_the_fields_are_and_what_was_rejected(dataset: Path) -> None:
+    card = (dataset / "README.md").read_text()
+    assert card.startswith('---\nlicense: "cc-by-4.0"\npretty_name: "A \\"small\\" dataset: for tests"\n')
+    assert '  - split: train\n    path: "train/*.h5"\n  - split: validation\n    path: "validation/*.h5"\n---' in card
+    assert "\n\nSome notes.\n\n" in card
+    for field in FIELDS:
+        assert f"| `{field.name}` | {field.unit} |" in card
+    assert "| no IK | 57 | 47.500 % |" in card
+    assert "| `plane` | 2e-09 |" in card
+    assert "| `start_q.j1` | rad |" in card
+    assert "cnpgen validate . --deep" in card
+
+
+def test_the_card_s_loader_loads_the_dataset(dataset: Path) -> None:
+    code = (dataset / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    names: dict[str, object] = {}
+    with contextlib.chdir(dataset), contextlib.redirect_stdout(io.StringIO()):
+        exec(code, names)
+    rows = names["rows"]
+    assert isinstance(rows, dict)
+    assert rows["start_q"].shape == (50, 3)
+    assert rows["sample_id"].tolist() == list(range(50))

@@ -1,0 +1,324 @@
+"""Runs: cut and resumed they give the bits of an uncut one; what goes wrong is said."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.losses.metric_settings import BOUNDED
+from cnpgen.make.dataset import make_dataset
+from cnpgen.planner.model import Model
+from cnpgen.planner.model_file import load_model
+from cnpgen.training import checkpoint as checkpoints
+from cnpgen.training.train import Trained, train_model
+from tests.conftest import tiny_recipe
+from tests.examples.models import SMALL
+
+STEPS = 30
+Train = Callable[..., Trained]
+
+
+class CutOffError(Exception):
+    """Raised in the middle of a run."""
+
+
+@pytest.fixture
+def train(tiny: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Train:
+    """Train a small model of the hits; checkpoints are written all the time."""
+    monkeypatch.setattr(checkpoints, "EVERY", 0.0)
+    monkeypatch.setattr(checkpoints, "SHARE", 3.0)
+
+    def run(out: str = "model.h5", **options: Any) -> Trained:
+        arguments = {"steps": STEPS, "settings": SMALL, "check_rows": 2, "workers": 1, **options}
+        return train_model(tiny("airhockey-hit"), tmp_path / out, **arguments)
+
+    return run
+
+
+def cut_at(step: int) -> Callable[[Any], None]:
+    def watch(record: Any) -> None:
+        if record["step"] >= step:
+            raise CutOffError
+
+    return watch
+
+
+def lines(model: Model) -> list[dict[str, Any]]:
+    """The log without times."""
+    return [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in model.log.splitlines()]
+
+
+@pytest.mark.parametrize("metric", [SMALL.metric, replace(BOUNDED, every="batch")], ids=["ramped", "learned"])
+def test_a_run_that_was_cut_and_resumed_gives_the_bits_and_the_log_of_an_uncut_one(train, metric):
+    settings = replace(SMALL, metric=metric)
+    whole = train("whole.h5", settings=settings)
+    for step in (3, 17, 29):
+        with pytest.raises(CutOffError):
+            train("cut.h5", settings=settings, watch=cut_at(step))
+    cut = train("cut.h5", settings=settings)
+    np.testing.assert_array_equal(cut.model.parameters, whole.model.parameters)
+    assert lines(cut.model) == lines(whole.model)
+    assert cut.model.training["best_step"] == whole.model.training["best_step"]
+    assert cut.score == whole.score
+
+
+def test_seeds_give_the_same_model_again_and_another_seed_another(train):
+    first, again = train("a.h5"), train("b.h5")
+    other = train("c.h5", settings=replace(SMALL, seed=1))
+    np.testing.assert_array_equal(first.model.parameters, again.model.parameters)
+    assert (first.model.parameters != other.model.parameters).any()
+
+
+def test_the_model_that_is_kept_is_the_best_of_those_that_were_validated(train):
+    trained = train()
+    checks = [record for record in lines(trained.model) if "validation" in record]
+    best = max(checks, key=lambda record: (record["validation"]["score"], record["step"]))
+    assert len(checks) == 10
+    assert trained.model.training["best_step"] == best["step"]
+
+
+def test_training_makes_plans_better(train):
+    trained = train(steps=300, settings=replace(SMALL, hidden=32))
+    steps = [record for record in lines(trained.model) if "loss" in record]
+    for name in ("joint-acceleration", "joint-torque"):
+        assert steps[-1]["terms"][name] < 0.05 * steps[0]["terms"][name]
+    assert steps[-1]["terms"]["table"] < steps[-1]["budgets"]["table"]  # the landing sees to it from the beginning
+    assert trained.score["z_error_mm_s"] < 5
+
+
+def test_the_log_says_loss_terms_budgets_weights_and_rate_of_every_hundredth_and_is_in_the_model(train, tmp_path):
+    trained = train()
+    on_disk = (tmp_path / "model.jsonl").read_text()
+    assert trained.model.log == on_disk == load_model(trained.path).log
+    record = json.loads(on_disk.splitlines()[0])
+    assert {"step", "epoch", "learning_rate", "seconds", "loss", "terms", "weights", "budgets", "lost"} <= record.keys()
+    weighted = record["terms"]["time"] + sum(record["terms"][k] * w for k, w in record["weights"].items())
+    assert record["loss"] == pytest.approx(weighted)
+    assert not (tmp_path / "model.checkpoint").exists()
+
+
+def test_seconds_become_steps_before_the_run_begins(train):
+    begun = []
+    trained = train(steps=None, cpu_seconds=0.2, begin=lambda state, run: begun.append(state.steps))
+    assert begun == [trained.model.training["steps"]]
+    assert 10 < begun[0] < 2000
+
+
+def test_epochs_become_steps_too(train):
+    assert train(steps=None, epochs=2).model.training["steps"] == 2 * (600 // 32)
+
+
+def test_a_finished_model_is_returned_as_it_is_and_another_one_is_replaced_only_by_force(train, tmp_path):
+    first = train()
+    before = (tmp_path / "model.h5").read_bytes()
+    again = train(begin=lambda *_: pytest.fail("trained again"))
+    assert (first.made, again.made) == (True, False)
+    assert again.score == first.model.training["score"]
+    np.testing.assert_array_equal(again.model.parameters, first.model.parameters)
+    for options, differs in (
+        ({"settings": replace(SMALL, seed=1)}, r"settings\.seed \(0, now 1\)"),
+        ({"steps": 31}, r"length\.steps \(30, now 31\)"),
+        ({"check_rows": 3}, r"check_rows \(2, now 3\)"),
+    ):
+        with pytest.raises(UsageError, match=rf"model\.h5 is another model.*{differs}.*--force"):
+            train(**options)
+    assert (tmp_path / "model.h5").read_bytes() == before
+    assert train(steps=31, force=True).model.training["steps"] == 31
+
+
+@pytest.mark.parametrize("out", ["missing/model.h5", "model", "model.jsonl", "."])
+def test_a_place_where_no_model_can_go_is_refused_before_any_work(train, out):
+    with pytest.raises(UsageError, match=r"must be a file that ends in \.h5, in a folder that exists"):
+        train(out)
+
+
+def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
+    (tmp_path / "model.h5").write_bytes(b"mine")
+    with pytest.raises(UsageError, match=r"model\.h5 exists and is no model.*--force"):
+        train()
+    assert (tmp_path / "model.h5").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("wrong", [{"check_rows": 0}, {"steps": 2.5}, {"steps": None, "cpu_seconds": float("inf")}])
+def test_arguments_that_cannot_be_meant_are_refused_by_name(train, wrong):
+    with pytest.raises(UsageError, match=r"^(check_rows|steps|cpu_seconds) must be .*, got (0|2\.5|inf)"):
+        train(**wrong)
+
+
+def test_whole_numbers_of_numpy_make_the_same_run(train):
+    train(steps=np.int64(STEPS), settings=replace(SMALL, seed=np.int64(2)), check_rows=np.int32(2))
+    assert not train(settings=replace(SMALL, seed=2)).made
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_the_run_after_the_step_that_it_came_in(train, tmp_path, number):
+    whole = train("whole.h5")
+    before, steps = signal.signal(number, signal.default_int_handler), []
+
+    def interrupt(record: Any) -> None:
+        steps.append(record["step"])
+        if record["step"] == 17:
+            signal.raise_signal(number)
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train("cut.h5", watch=interrupt)
+    finally:
+        signal.signal(number, before)
+    assert steps[-1] == 17
+    begun = []
+    cut = train("cut.h5", begin=lambda state, run: begun.append(state.adam.step))
+    assert begun == [17]
+    np.testing.assert_array_equal(cut.model.parameters, whole.model.parameters)
+    assert lines(cut.model) == lines(whole.model)
+
+
+def test_force_goes_on_with_its_own_checkpoint_and_throws_away_another_one(train):
+    begun = []
+    with pytest.raises(CutOffError):
+        train(force=True, watch=cut_at(15))
+    train(force=True, begin=lambda state, run: begun.append(state.adam.step))
+    with pytest.raises(CutOffError):
+        train(force=True, watch=cut_at(15))
+    train(force=True, steps=31, begin=lambda state, run: begun.append(state.adam.step))
+    assert begun[0] > 0
+    assert begun[1] == 0
+
+
+def test_the_checkpoint_of_another_run_is_not_taken_for_this_one(train):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(5))
+    with pytest.raises(UsageError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"):
+        train(settings=replace(SMALL, learning_rate=2e-3))
+    train(settings=replace(SMALL, learning_rate=2e-3), force=True)
+
+
+def test_a_damaged_checkpoint_is_an_error_and_no_other_model(train, tmp_path):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(5))
+    path = tmp_path / "model.checkpoint"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DatasetError, match=r"model\.checkpoint is damaged"):
+        train()
+
+
+def test_deaths_between_the_last_step_and_the_model_leave_one_last_line(train, tmp_path, monkeypatch):
+    """The log's last line comes after the last checkpoint: what dies while the model is written writes it again."""
+    whole = train("whole.h5")
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr("cnpgen.training.train.save_model", dying)
+            with pytest.raises(CutOffError):
+                train("cut.h5")
+    cut = train("cut.h5")
+    assert lines(cut.model) == lines(whole.model)
+    assert sum("final" in line for line in (tmp_path / "cut.jsonl").read_text().splitlines()) == 1
+    np.testing.assert_array_equal(cut.model.parameters, whole.model.parameters)
+
+
+def dying(*_: Any) -> None:
+    raise CutOffError
+
+
+@pytest.mark.parametrize("left", [None, b"", b'{"step": 1'])
+def test_a_resumed_run_has_its_whole_log_whatever_became_of_the_file(train, tmp_path, left):
+    whole = train("whole.h5")
+    with pytest.raises(CutOffError):
+        train("cut.h5", watch=cut_at(20))
+    log = tmp_path / "cut.jsonl"
+    log.unlink() if left is None else log.write_bytes(left)
+    cut = train("cut.h5", force=True)
+    assert lines(cut.model) == lines(whole.model)
+    assert log.read_text() == cut.model.log
+
+
+def test_the_log_is_never_half_written_over(train, tmp_path, monkeypatch):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(20))
+    before = (tmp_path / "model.jsonl").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", dying)  # as if killed before the new file has its name
+        with pytest.raises(CutOffError):
+            train()
+    assert (tmp_path / "model.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["model.jsonl", "model.png"])
+def test_files_of_others_beside_the_model_are_not_replaced_without_force(train, tmp_path, name):
+    path = tmp_path / name
+    path.write_text('{"step": 1, "my": "data"}\n')
+    with pytest.raises(UsageError, match=rf"{name} is there.*--force replaces it"):
+        train(begin=lambda *_: pytest.fail("trained"))
+    assert path.read_text() == '{"step": 1, "my": "data"}\n'
+    assert train(force=True).made
+
+
+def test_the_log_and_the_picture_of_a_run_are_replaced_by_those_of_the_next_one(train, tmp_path):
+    train()
+    (tmp_path / "model.h5").unlink()
+    (tmp_path / "model.png").write_bytes(b"drawn of the log")
+    assert train(steps=31).made
+
+
+def test_what_killed_runs_were_writing_is_removed_and_nothing_else(train, tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
+        gone.wait()
+    mine = [f".model.{end}.{gone.pid}.{'0' * 32}.tmp" for end in ("h5", "checkpoint", "jsonl")]
+    others = [f".model.h5.{os.getppid()}.{'0' * 32}.tmp", f".other.h5.{gone.pid}.{'0' * 32}.tmp", ".model.h5.tmp"]
+    for name in (*mine, *others):
+        (tmp_path / name).write_bytes(b"half")
+    train()
+    left = {path.name for path in tmp_path.iterdir() if path.name.startswith(".")}
+    assert left == set(others)
+
+
+def test_a_dataset_that_has_changed_since_is_not_trained_on_further(train, tmp_path):
+    with pytest.raises(CutOffError):
+        train(watch=cut_at(5))
+    other = tmp_path / "other"
+    make_dataset(tiny_recipe("airhockey-hit", seed=7), other, workers=1)
+    with pytest.raises(UsageError, match=r"another run.*dataset\.(seed|fingerprint)"):
+        train_model(other, tmp_path / "model.h5", steps=STEPS, settings=SMALL, check_rows=2)
+
+
+def test_a_dataset_without_a_second_split_cannot_be_validated_on(tmp_path):
+    recipe = replace(tiny_recipe("airhockey-hit"), splits={"train": 64})
+    make_dataset(recipe, tmp_path / "one", workers=1)
+    with pytest.raises(DatasetError, match="another one to validate with"):
+        train_model(tmp_path / "one", tmp_path / "model.h5", steps=2, settings=SMALL)
+
+
+def test_a_killed_run_goes_on_where_its_checkpoint_was(train, tiny, tmp_path):
+    code = f"""
+from pathlib import Path
+from cnpgen.training import checkpoint
+from cnpgen.training.settings import TrainingSettings
+from cnpgen.training.train import train_model
+checkpoint.EVERY, checkpoint.SHARE = 0.0, 3.0
+train_model({str(tiny("airhockey-hit"))!r}, {str(tmp_path / "cut.h5")!r}, steps=600, check_rows=2, workers=1,
+    settings=TrainingSettings(hidden=16, layers=2, batch_size=32, nodes=16))
+"""
+    path, environment = tmp_path / "cut.checkpoint", {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment) as process:
+        deadline = time.monotonic() + 60
+        while not path.exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(0.3)
+        os.kill(process.pid, signal.SIGKILL)
+    assert path.exists()
+    begun = []
+    cut = train("cut.h5", steps=600, check_rows=2, begin=lambda state, run: begun.append(state.adam.step))
+    assert 0 < begun[0] < 600
+    np.testing.assert_array_equal(cut.model.parameters, train("whole.h5", steps=600, check_rows=2).model.parameters)

@@ -1,0 +1,180 @@
+"""The doctor: what is there, what is missing, and what to do about it."""
+
+import dataclasses
+import importlib
+import json
+import os
+import re
+import sys
+import tomllib
+import types
+from pathlib import Path
+
+import pytest
+
+from cnpgen.kernels.compiled import find_compiler
+from cnpgen.machine import threads
+from cnpgen.validate import machine
+from cnpgen.validate.machine import check_machine, vector_instructions
+
+
+@pytest.fixture
+def fresh_compiler():
+    find_compiler.cache_clear()
+    yield
+    find_compiler.cache_clear()
+
+
+def test_this_machine_is_well():
+    report = check_machine()
+    assert report.ok, report.problems
+    assert report.libraries["pin"][0].isdigit()
+    assert report.backend in {"compiled", "numpy"}
+    assert 1 <= report.cores <= report.cores_present
+    assert report.hdf5[0].isdigit()
+    assert report.free_bytes > 0
+    assert "3 datasets" in report.recipes
+
+
+def test_every_dependency_is_looked_for():
+    declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert sorted(machine.NEEDED.values()) == sorted(re.split("[<>=]", each)[0] for each in declared["dependencies"])
+
+
+def test_the_report_is_frozen_and_has_a_json_form():
+    report = check_machine()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        report.backend = ""
+    content = json.loads(json.dumps(report.to_dict()))
+    assert content["ok"] is True
+    assert content["libraries"]["numpy"]
+
+
+def test_the_other_project_called_pinocchio_is_recognised(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pinocchio", types.ModuleType("pinocchio"))
+    report = check_machine()
+    assert not report.ok
+    (problem,) = report.problems
+    assert "another project of that name" in problem
+    assert "pip uninstall pinocchio" in problem
+    assert problem.endswith("--force-reinstall pin'")
+
+
+def _import_failing(monkeypatch, broken, error):
+    original = importlib.import_module
+
+    def fail(name, *rest):
+        if name == broken:
+            raise error
+        return original(name, *rest)
+
+    monkeypatch.setattr(machine.importlib, "import_module", fail)
+
+
+def test_a_missing_library_is_named_with_its_project(monkeypatch):
+    _import_failing(monkeypatch, "pinocchio", ModuleNotFoundError("No module named 'pinocchio'", name="pinocchio"))
+    report = check_machine()
+    assert report.libraries["pin"] == "missing"
+    assert report.problems[0].startswith("pin is not installed: run '")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("libboost.so.1:\n cannot open"),
+        ModuleNotFoundError("No module named 'eigenpy'", name="eigenpy"),
+        RuntimeError("compiled for another NumPy"),
+    ],
+)
+def test_a_broken_library_is_one_line_with_a_remedy(monkeypatch, error):
+    _import_failing(monkeypatch, "coal", error)
+    report = check_machine()
+    assert report.libraries["coal"] == "broken"
+    assert "\n" not in report.problems[0]
+    assert "--force-reinstall coal" in report.problems[0]
+
+
+def test_a_working_directory_that_is_gone_is_a_note(monkeypatch, tmp_path):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    report = check_machine()
+    assert report.ok
+    assert report.free_bytes == 0
+    assert any(note.startswith("the working directory cannot be looked at (No such file") for note in report.notes)
+
+
+def test_a_missing_plotting_library_is_only_a_note(monkeypatch):
+    _import_failing(monkeypatch, "matplotlib", ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib"))
+    report = check_machine()
+    assert report.ok
+    assert any("--plot" in note for note in report.notes)
+
+
+def test_without_a_compiler_the_numpy_backend_runs(monkeypatch, fresh_compiler):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    report = check_machine()
+    assert report.ok
+    assert report.backend == "numpy"
+    assert report.compiler == ""
+    assert report.environment["CC"] == "no-such-compiler"
+    assert any("no C compiler" in note for note in report.notes)
+
+
+def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "file" / "cache"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    report = check_machine()
+    assert report.ok
+    assert not report.cache_writable
+    assert any("CNPGEN_CACHE" in note for note in report.notes)
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_a_container_with_fewer_cores_is_a_note(monkeypatch):
+    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _pid: set(range(64)), raising=False)
+    report = check_machine()
+    assert report.cores < 64
+    assert any("--workers" in note for note in report.notes)
+
+
+def test_recipes_that_do_not_load_are_a_problem(monkeypatch, tmp_path):
+    monkeypatch.setattr("cnpgen.schema.catalogue.recipes_root", lambda: tmp_path)
+    report = check_machine()
+    assert not report.ok
+    assert "no recipes" in report.problems[0]
+
+
+def test_little_free_disk_is_a_note(monkeypatch):
+    monkeypatch.setattr(machine, "ENOUGH_DISK", 10**30)
+    assert any("MB are free" in note for note in check_machine().notes)
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [("sse2 avx avx2 avx512f", "avx512"), ("sse2 avx avx2", "avx2"), ("sse2", "sse2"), ("none", "unknown")],
+)
+def test_vector_instructions_are_read_from_cpuinfo(monkeypatch, flags, name):
+    monkeypatch.setattr(machine.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(machine.Path, "read_text", lambda *_, **__: f"processor : 0\nflags\t\t: fpu {flags}\n")
+    assert vector_instructions() == name
+
+
+def test_arm_has_neon(monkeypatch):
+    monkeypatch.setattr(machine.platform, "machine", lambda: "arm64")
+    assert vector_instructions() == "neon"
+
+
+def test_variables_that_nobody_set_are_not_reported(monkeypatch):
+    for name in threads.VARIABLES:
+        monkeypatch.setenv(name, "")  # so that it is put back afterwards, set or not
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("MKL_NUM_THREADS", "1")
+    monkeypatch.setattr(threads, "_preferred", {})
+    threads.prefer_one_thread()
+    assert all(os.environ[name] == "1" for name in threads.VARIABLES)
+    assert set(threads.VARIABLES) & check_machine().environment.keys() == {"MKL_NUM_THREADS"}
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    assert check_machine().environment["OMP_NUM_THREADS"] == "4"

@@ -1,0 +1,106 @@
+"""Stored numbers are checked by themselves: ranges, order, counts and statistics, each with a case that is wrong."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.make.dataset import make_dataset
+from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
+from cnpgen.store.record import ShardRecord, load_record
+from cnpgen.store.shard import read_shard
+from cnpgen.store.statistics import column_statistics
+from cnpgen.validate.numbers import check_numbers
+from tests.conftest import SHIPPED, TINY_SHARD, tiny_recipe
+
+Columns = dict[str, np.ndarray]
+Parts = tuple[Blueprint, ShardTask, Columns, ShardRecord]
+
+
+def parts(folder: Path, index: int = 1) -> Parts:
+    plan = load_blueprint(folder)
+    task = shards(plan)[index]
+    return plan, task, read_shard(folder / task.file), load_record(folder, task)
+
+
+@pytest.fixture
+def shard(tiny: Callable[[str], Path]) -> Parts:
+    """Rows 250 to 499 of air-hockey replanning."""
+    return parts(tiny("airhockey-replan"))
+
+
+def changed(shard: Parts, name: str, where: Any, value: Any) -> list[str]:
+    """What is found after a change that the statistics know of."""
+    plan, task, columns, record = shard
+    columns[name][where] = value
+    return check_numbers(plan, task, columns, replace(record, statistics=column_statistics(columns, plan.fields)))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_nothing_is_wrong_with_what_was_made(tiny, tmp_path, name, dtype):
+    folder = tiny(name)
+    if dtype == "float32":
+        folder = tmp_path / name
+        make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype)
+    for index in range(4):
+        assert check_numbers(*parts(folder, index)) == []
+
+
+@pytest.mark.parametrize(("name", "column"), [("start_q", 2), ("start_dq", 0), ("start_ddq", 5), ("goal_xyz", 1)])
+@pytest.mark.parametrize("side", ["valid_min", "valid_max"])
+def test_a_number_beyond_its_range_is_named(shard, name, column, side):
+    bound = getattr(shard[0].field_named(name), side)[column]
+    outwards = 1 if side == "valid_max" else -1
+    assert changed(shard, name, (17, column), bound + outwards * 1e-13) == []
+    (problem,) = changed(shard, name, (17, column), bound + outwards * 1e-6)
+    assert problem.startswith(f"{name} is beyond its {side} by up to 1e-06 ")
+    assert problem.endswith(": 1 of 250 rows, the first one is row 267")
+
+
+def test_float32_may_be_off_by_its_last_digit(tmp_path):
+    make_dataset(tiny_recipe("airhockey-replan"), tmp_path, shard_size=TINY_SHARD, workers=1, dtype="float32")
+    shard = parts(tmp_path)
+    height = np.float32(0.16)
+    assert changed(shard, "goal_xyz", (3, 2), height) == []
+    assert changed(shard, "goal_xyz", (3, 2), np.nextafter(height, np.float32(1))) == []
+    assert len(changed(shard, "goal_xyz", (3, 2), height + np.float32(1e-6))) == 1
+
+
+def test_a_hit_faster_than_the_fastest_one_is_named(shard):
+    fastest = float(shard[2]["hit_speed_max"][7])
+    (problem,) = changed(shard, "hit_speed", 7, np.nextafter(fastest, 9.0))
+    assert problem == "hit_speed is above hit_speed_max: 1 of 250 rows, the first one is row 257"
+    assert changed(shard, "hit_speed", 7, fastest) == []
+
+
+def test_rows_must_be_counted_and_draws_add_up(shard):
+    (first,) = changed(shard, "sample_id", 4, 3)
+    assert first == "sample_id does not count the rows of the split"
+    shard[2]["sample_id"][4] = 254
+    tried = shard[3].outcome.tried
+    (second,) = changed(shard, "attempts", 4, shard[2]["attempts"][4] + 1)
+    assert second == f"attempts sum to {tried + 1}, but {tried} draws are recorded"
+
+
+def test_statistics_must_be_those_of_the_values(shard):
+    plan, task, columns, record = shard
+    columns["hit_angle"][9] *= 0.99
+    assert check_numbers(plan, task, columns, record) == [
+        "the recorded statistics of hit_angle are not those of its values"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("what", "by", "wrong"), [("mean", 1e-12, 0), ("mean", 1e-6, 1), ("m2", 1e-12, 0), ("m2", 1e-6, 1)]
+)
+def test_sums_may_differ_in_their_last_digits_only(shard, what, by, wrong):
+    plan, task, columns, record = shard
+    item = record.statistics["hit_speed"]
+    record = replace(
+        record, statistics={**record.statistics, "hit_speed": replace(item, **{what: getattr(item, what) * (1 + by)})}
+    )
+    assert len(check_numbers(plan, task, columns, record)) == wrong
