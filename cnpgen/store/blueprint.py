@@ -209,25 +209,8 @@ def _field(content: Mapping[str, Any]) -> Field:
     return Field(**{**content, "names": tuple(content["names"]), **limits})
 
 
-def save_plan(folder: Path, blueprint: Blueprint) -> None:
-    """Write ``blueprint.json``; a folder that holds the same plan already is left as it is.
-
-    Raises:
-        DatasetError: The folder holds another dataset, or something else.
-        MachineError: The folder cannot be written.
-    """
-    path = folder / PLAN
-    if path.exists():
-        if load_blueprint(folder).fingerprint != blueprint.fingerprint:
-            raise DatasetError(f"{folder} holds another dataset (its plan differs): choose another folder or remove it")
-        return
-    if folder.is_dir() and any(item.name != WORK for item in folder.iterdir()):
-        raise DatasetError(f"{folder} is not empty and holds no dataset: choose another folder or empty it")
-    write_plan(folder, blueprint)
-
-
-def write_plan(folder: Path, blueprint: Blueprint) -> None:
-    """Write ``blueprint.json``, whatever was there.
+def write_blueprint(folder: Path, blueprint: Blueprint) -> None:
+    """Write ``plan.json``, whatever was there.
 
     Raises:
         MachineError: The folder cannot be written.
@@ -237,7 +220,7 @@ def write_plan(folder: Path, blueprint: Blueprint) -> None:
 
 
 def load_blueprint(folder: Path) -> Blueprint:
-    """Read ``blueprint.json``.
+    """Read ``plan.json``.
 
     Raises:
         DatasetError: It is missing, damaged or written by a newer cnpgen.

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, check_dataset, check_documents
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import save_document
@@ -142,7 +142,7 @@ def test_files_that_do_not_belong_to_the_dataset_are_notes(dataset: Path) -> Non
 
 
 def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     for task in shards(PLAN)[:2]:
         make_shard(tmp_path, PLAN, task)
     message = "is missing: the dataset is unfinished: 2 of 3 shards are there; run the same make-dataset command again"
@@ -211,5 +211,5 @@ def test_changed_documents_are_found_without_reading_a_shard(
 
 
 def test_a_dataset_that_is_finished_again_is_good(dataset: Path) -> None:
-    finalize(dataset)
+    finalize(dataset, PLAN)
     assert check_dataset(dataset) == []
