@@ -7,7 +7,7 @@ from typing import Any
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
+from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
 from cnpgen.make.shards import Job
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
@@ -16,8 +16,6 @@ from cnpgen.store.blueprint import Blueprint, default_shard_size
 from cnpgen.store.workspace import Workspace
 
 MAX_ROWS = 10**12
-MAX_SEED = 2**63 - 1
-DTYPES = ("float64", "float32")
 
 
 def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
@@ -65,7 +63,7 @@ def draw_up(
         UsageError: An argument makes no sense.
         MachineError: No working backend.
     """
-    total, root, shard_size = _check(recipe, n, seed, shard_size, dtype)
+    total, root, shard_size = _check(recipe, n, seed, shard_size)
     digest, begun = recipe_digest(recipe), workspace.blueprint
     if begun is not None and begun.recipe_sha256 == digest and not force:
         backend = begun.backend if backend is None else backend
@@ -93,15 +91,13 @@ def draw_up(
 
 
 def _check(
-    recipe: DatasetRecipe, n: int | None, seed: int | None, shard_size: int | None, dtype: str
+    recipe: DatasetRecipe, n: int | None, seed: int | None, shard_size: int | None
 ) -> tuple[int, int, int | None]:
     """Return rows, seed and shard size; refuse what no file of a recipe can say, but a recipe made in Python."""
     for split, rows in recipe.splits.items():
         integer(f"the rows of split {split!r}", rows, least=1)
     if not recipe.splits:
         raise UsageError(f"{recipe.name} has no splits: expected rows of at least one, such as {{'train': 1000}}")
-    if dtype not in DTYPES:
-        raise UsageError(f"dtype must be {' or '.join(map(repr, DTYPES))}, got {dtype!r}")
     total = integer("n", sum(recipe.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
     root = integer("seed", recipe.seed if seed is None else seed, least=0, most=MAX_SEED)
     return total, root, None if shard_size is None else integer("shard_size", shard_size, least=1)

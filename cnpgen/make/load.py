@@ -54,7 +54,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
 
 
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
-    """Rebuild a recipe from what ``recipes.resolved`` made of it, as plans of datasets keep it.
+    """Rebuild a recipe from what ``resolved`` made of it, as blueprints of datasets keep it.
 
     Args:
         content: The resolved recipe.

@@ -45,6 +45,11 @@ class Job:
     cache_folder: Path
 
 
+def prepare(job: Job) -> PreparedPipeline:
+    """Load the stages of what is made."""
+    return PreparedPipeline(job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype)
+
+
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Fates]]:
     """Make, check and commit shards of one split; running it twice is harmless.
 
@@ -164,7 +169,5 @@ def _prepared(job: Job) -> PreparedPipeline:
     key = f"{job.blueprint.fingerprint} {job.cache_folder}"
     if key not in _PREPARED:
         _PREPARED.clear()
-        _PREPARED[key] = PreparedPipeline(
-            job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype
-        )
+        _PREPARED[key] = prepare(job)
     return _PREPARED[key]

@@ -40,7 +40,7 @@ class PreparedPipeline:
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
-        if dtype not in EXACTNESS:
+        if dtype not in list(EXACTNESS):
             raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
         problem = pipeline.problem
         robot = load_robot(problem)

@@ -25,7 +25,7 @@ class Inspection:
 
     Attributes:
         folder: Its folder.
-        summary: Its plan and the records of its finished shards.
+        summary: Its blueprint and the records of its finished shards.
         sealed: Whether its manifest is there.
         bytes: Size of its files.
         damage: What is wrong with the documents of a sealed dataset, a line each; shards are not read for it.
@@ -39,7 +39,7 @@ class Inspection:
 
     @property
     def blueprint(self) -> Blueprint:
-        """The plan of the dataset."""
+        """The blueprint of the dataset."""
         return self.summary.blueprint
 
     @property
@@ -147,7 +147,7 @@ def inspect_dataset(folder: str | Path) -> Inspection:
 
     Raises:
         UsageError: There is no such folder.
-        DatasetError: It holds no dataset, or its plan is damaged.
+        DatasetError: It holds no dataset, or its plan.json is damaged.
         MachineError: The system would not let us read something.
     """
     folder = Path(folder)

@@ -117,7 +117,7 @@ def commit_shard(
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         task: Which shard.
         columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
         fates: Fates of the draws that were made for it.
@@ -129,7 +129,7 @@ def commit_shard(
         The shard's record.
 
     Raises:
-        DatasetError: The columns are not what the plan says, or not finite.
+        DatasetError: The columns are not what the blueprint says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
     if is_committed(folder, task, blueprint.fingerprint):  # by somebody to whom the same work was given
@@ -171,20 +171,21 @@ def _write(
 
 
 def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardRecord:
-    """Read a shard's sidecar and make sure that it stands for a shard of this plan; the shard's content is not read.
+    """Read a shard's sidecar and make sure that it stands for a shard of this blueprint; the shard itself is not read.
 
     Args:
         folder: The dataset's folder.
         task: Which shard.
-        fingerprint: The plan's fingerprint.
+        fingerprint: The fingerprint of the blueprint.
 
     Raises:
-        DatasetError: The sidecar is missing, damaged or of another plan, or the shard is missing or has another size.
+        DatasetError: The sidecar is missing, damaged or of another blueprint, or the shard is missing or of another
+            size.
         MachineError: The system would not let us read it.
     """
     record = load_record(folder, task)
     if record.plan_fingerprint != fingerprint:
-        raise DatasetError(f"{folder / task.sidecar} belongs to another plan ({record.plan_fingerprint[:12]}...)")
+        raise DatasetError(f"{folder / task.sidecar} belongs to another blueprint ({record.plan_fingerprint[:12]}...)")
     path = folder / task.file
     size = path.stat().st_size if path.is_file() else None
     if size != record.bytes:
@@ -199,7 +200,7 @@ def check_committed(folder: Path, task: ShardTask, fingerprint: str) -> None:
     Args:
         folder: The dataset's folder.
         task: Which shard.
-        fingerprint: The plan's fingerprint.
+        fingerprint: The fingerprint of the blueprint.
 
     Raises:
         DatasetError: Like :func:`load_committed`, or the shard was changed.
@@ -211,7 +212,7 @@ def check_committed(folder: Path, task: ShardTask, fingerprint: str) -> None:
 
 
 def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
-    """Whether a shard is made: its sidecar is whole and of this plan, and its file has the recorded size."""
+    """Whether a shard is made: its sidecar is whole and of this blueprint, and its file has the recorded size."""
     try:
         load_committed(folder, task, fingerprint)
     except DatasetError:

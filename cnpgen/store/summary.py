@@ -19,11 +19,11 @@ _N_SHOWN = 5
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """A plan and the records of its shards.
+    """A blueprint and the records of its shards.
 
     Attributes:
-        blueprint: The plan.
-        records: Every finished shard and its record, in the plan's order.
+        blueprint: The blueprint.
+        records: Every finished shard and its record, in the blueprint's order.
         problems: Why each of the others is not finished.
     """
 
@@ -33,7 +33,7 @@ class Summary:
 
     @property
     def n_shards(self) -> int:
-        """Number of shards of the plan."""
+        """Number of shards of the blueprint."""
         return len(self.records) + len(self.problems)
 
     def of_split(self, split: str) -> list[tuple[ShardTask, ShardRecord]]:
@@ -62,11 +62,11 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_partial: bool = False
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         allow_partial: Take what is there instead of refusing.
 
     Raises:
-        DatasetError: A shard is missing, damaged or of another plan; the message says which.
+        DatasetError: A shard is missing, damaged or of another blueprint; the message says which.
         MachineError: The system would not let us read something.
     """
     records, problems = [], []

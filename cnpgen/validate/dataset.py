@@ -117,7 +117,7 @@ def validate_dataset(
     Raises:
         UsageError: There is no folder, or an argument makes no sense.
         DatasetError: It holds no dataset.
-        RecipeError: The recipe in the plan does not fit this version of cnpgen.
+        RecipeError: The recipe in the blueprint does not fit this version of cnpgen.
         PluginError: It needs packages that are not installed, for what was asked for.
         MachineError: The disk fails, or the backend that made the dataset does not work here and blocks are to be
             made again.

@@ -18,10 +18,10 @@ SUMMATION = 1e-9  # relative: what sums of the same numbers may differ by from o
 
 
 def check_numbers(blueprint: Blueprint, task: ShardTask, columns: Columns, record: ShardRecord) -> list[str]:
-    """Check the rows of a shard against its plan and its record.
+    """Check the rows of a shard against its blueprint and its record.
 
     Args:
-        blueprint: The dataset's plan.
+        blueprint: The blueprint of the dataset.
         task: The shard.
         columns: All its fields, shape (rows, width) or (rows,).
         record: What is recorded of it.

@@ -133,7 +133,7 @@ def test_shards_of_another_seed_and_cut_off_shards_are_refused(tmp_path: Path) -
     path = tmp_path / shards(PLAN)[1].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
-        DatasetError, match=r"(?s)00000\.json belongs to another plan.*00001\.h5 is not the recorded file"
+        DatasetError, match=r"(?s)00000\.json belongs to another blueprint.*00001\.h5 is not the recorded file"
     ):
         finalize(tmp_path, PLAN)
 

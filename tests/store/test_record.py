@@ -124,7 +124,7 @@ def test_a_flipped_digit_in_a_sidecar_is_noticed(tmp_path: Path) -> None:
 def test_missing_shards_and_those_of_another_plan_are_not_committed(tmp_path: Path) -> None:
     assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
     make_shard(tmp_path, PLAN, TASK)
-    with pytest.raises(DatasetError, match="another plan"):
+    with pytest.raises(DatasetError, match="another blueprint"):
         load_committed(tmp_path, TASK, replace(PLAN, seed=1).fingerprint)
     (tmp_path / TASK.file).unlink()
     assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
