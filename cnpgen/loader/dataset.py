@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from cnpgen.errors import DatasetError, nearest
+from cnpgen.errors import DatasetError, lacks
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.cut import Cut
 from cnpgen.loader.form import Form, make_form
@@ -167,7 +167,7 @@ class Dataset:
 
     def _source(self, split: str) -> SplitShards:
         if split not in self.shards:
-            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(str(split), self.shards)}")
+            raise DatasetError(f"{self.folder} {lacks('split', str(split), self.shards)}")
         return SplitShards(split, self.shards[split], self.reader, self.fingerprint, self.blueprint.dtype)
 
     def _form(

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.load import restore_problem
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.store.files.documents import canonical_sha256, plain
+from cnpgen.store.files.documents import canonical_sha256, differences, plain
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class ProblemRecord:
 
     def differences(self, other: "ProblemRecord") -> list[str]:
         """List the keys in which two problems differ, of those that the digest covers: ``"limits.velocity_scale"``."""
-        return list(_differences(_meaning(self), _meaning(other)))
+        return [each.key for each in differences(_meaning(self), _meaning(other))]
 
     @contextmanager
     def restored(self) -> Iterator[Problem]:
@@ -143,11 +143,3 @@ def _meaning(record: ProblemRecord) -> dict[str, Any]:
         name = f"{kind['use']} {count + 1}" if count else kind["use"]
         constraints[name] = {key: value for key, value in kind.items() if key not in _JUDGED_BY}
     return kept | {"robot": robot, "constraint": constraints}
-
-
-def _differences(one: Any, other: Any, key: str = "") -> Iterator[str]:
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        for name in [*one, *(name for name in other if name not in one)]:
-            yield from _differences(one.get(name), other.get(name), f"{key}.{name}" if key else name)
-    elif one != other:
-        yield key

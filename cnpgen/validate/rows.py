@@ -50,7 +50,7 @@ def check_rows(
 
     Args:
         folder: The dataset.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         tasks: The shards to read.
         workers: Processes.
         progress: Called with the rows of every shard that was read.

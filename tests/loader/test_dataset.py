@@ -13,7 +13,7 @@ from cnpgen.loader import shards as shards_module
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
 from tests.examples.loader import ALL, columns, ids, make
@@ -130,7 +130,7 @@ def test_the_real_thing_is_loaded(tiny) -> None:
 
 
 def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards"):
         load_dataset(tmp_path)

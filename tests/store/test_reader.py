@@ -13,7 +13,7 @@ import pytest
 from cnpgen.errors import DatasetError
 from cnpgen.loader.load import load_dataset
 from cnpgen.store import intact
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 from tests.examples.store import PLAN, dataset, make_columns, make_shard
@@ -61,7 +61,7 @@ def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
 
 
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run the same"):
         open_dataset(tmp_path)
@@ -127,7 +127,7 @@ def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypat
 def test_a_folder_that_mixes_two_datasets_is_refused(tmp_path: Path, dataset: Path) -> None:
     from dataclasses import replace
 
-    save_plan(tmp_path / "other", replace(PLAN, seed=1))
+    write_blueprint(tmp_path / "other", replace(PLAN, seed=1))
     (dataset / "plan.json").write_bytes((tmp_path / "other" / "plan.json").read_bytes())
     with pytest.raises(DatasetError, match="mixes two datasets"):
         open_dataset(dataset)
