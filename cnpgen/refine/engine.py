@@ -103,5 +103,4 @@ def load_refiner(
         criterion=choose_criterion(problem, options.objective, options.weight),
         settings=settings,
         passes=passes,
-        solver=options.solver,
     )
