@@ -130,7 +130,7 @@ def _run(
     if not waiting:
         return
     count = worker_count(1 if workers is None and len(waiting) <= ALONE else workers, -(-len(waiting) // PART))
-    size = PART if count > 1 and options.solver == "own" else 1
+    size = PART if count > 1 else 1
     parts = [waiting[first : first + size] for first in range(0, len(waiting), size)]
     prepare(plans, options)  # kernels are compiled once, not by every worker
     tasks = ((part, plans.select(np.array(part))) for part in parts)

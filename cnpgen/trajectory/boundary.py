@@ -1,6 +1,7 @@
 """Boundary control points: position, velocity and acceleration at the ends, exactly (paper, Appendix A)."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,11 @@ class Boundary:
     goal_q: Array
     goal_dq: Array
     goal_ddq: Array | None = None
+
+    @classmethod
+    def from_columns(cls, columns: Mapping[str, Array]) -> "Boundary":
+        """Take boundary conditions out of columns, name -> values of shape (N, n): rows of a dataset, for example."""
+        return cls(**{each.name: columns[each.name] for each in fields(cls) if each.name in columns})
 
     @property
     def fixed_at_goal(self) -> int:
