@@ -14,7 +14,7 @@ from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
-from cnpgen.schema.catalogue import digest_of, find_file, load_recipe, read_kind, reference
+from cnpgen.schema.catalogue import find_file, load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind, is_kind, read_table
@@ -102,16 +102,15 @@ def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | Non
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
-    read = read_table(path, ("dataset", "pipeline"), mistakes)
-    if read is None:
+    table = read_table(path, ("dataset", "pipeline"), mistakes)
+    if table is None:
         return None
-    data, table = read
     if not is_kind("dataset", table) and is_kind("pipeline", table):
         pipeline = read_pipeline(path, mistakes)
         return _wrapped(pipeline) if pipeline else None
     readers: dict[type, Reader] = {Pipeline: reference("pipeline", read_pipeline, path.parent)}
     made = parse(DatasetRecipe, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
-    return made and replace(made, path=path.absolute(), digest=digest_of(data, made.pipeline.digest.encode()))
+    return made and replace(made, path=path.absolute())
 
 
 def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
@@ -122,7 +121,6 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         pipeline=pipeline,
         splits={"train": 90, "validation": 10},
         path=pipeline.path,
-        digest=digest_of(b"", pipeline.digest.encode()),
     )
 
 

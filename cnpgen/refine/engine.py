@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import ProblemRecord, open_problem
@@ -92,12 +92,11 @@ def load_refiner(
     from cnpgen.world.state import World
 
     backend, cache_folder = choose_backend(None)
-    kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
     return Refiner(
         problem,
         robot,
-        kernels=kernels,
+        kernels=problem_kernels(problem, robot, backend, cache_folder),
         world=World(robot, problem.obstacle, problem.object_size),
         spec=spec,
         criterion=choose_criterion(problem, options.objective, options.weight),
