@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from cnpgen.store.files.atomic import write_file
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
+PACKAGE = Path(__file__).parents[1]
+ROOMS = ("robots", "symbolic", "kernels", "problems", "trajectory")  # what builders of any room import
 SLOWER = "10 to 20 times slower than compiled code"  # benchmarks/generator.py measures it: 9 to 24
 
 
@@ -37,7 +39,7 @@ class KernelLibrary:
     Attributes:
         backend: "compiled", "numpy" (the tape interpreted) or "casadi" (its own map; slow, for reference).
         cache_folder: Where tapes and libraries are kept.
-        identity: Digest of what builders read besides their parameters: problem and URDF.
+        identity: Digest of what builders read besides their parameters: of all ``arguments``.
         arguments: Named objects handed to builders that ask for them by parameter name (robot, problem).
     """
 
@@ -117,7 +119,7 @@ class KernelLibrary:
 
         identity = {
             "builder": f"{builder.__module__}.{builder.__qualname__}",
-            "source": [_shared_digest(), _source_digest(builder)],
+            "source": _source_digests(builder),
             "versions": [importlib.metadata.version(name) for name in ("casadi", "pin")],
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
@@ -136,28 +138,38 @@ class KernelLibrary:
             return tape
 
 
-@cache
-def _shared_digest() -> str:
-    """Digest of what builders of several folders use: kernels are rebuilt when it changes."""
-    root = Path(__file__).parents[1]
-    return _digest_of(*(root / folder for folder in ("robots", "symbolic", "kernels", "problems", "trajectory")))
+def _source_digests(builder: Callable[..., Any]) -> list[str]:
+    """Digests of what a builder may be made of: kernels are rebuilt when one of them changes.
 
-
-def _source_digest(builder: Callable[..., Any]) -> str:
-    """Digest of a builder's folder in this package, or of the whole package that a plug-in's builder comes from."""
-    package, source = builder.__module__.partition(".")[0], inspect.getsourcefile(builder)
+    In this package these are ``ROOMS`` and the builder's own room. A plug-in's builder may import anything, so that all
+    of this package counts, and all of its own.
+    """
+    package, _, module = builder.__module__.partition(".")
     if package != "cnpgen":
-        return package_digest(package)
-    return _digest_of(Path(source).parent) if source else ""
+        return [_digest_of(PACKAGE), package_digest(package)]
+    return [_digest_of(*(PACKAGE / room for room in ROOMS)), _digest_of(PACKAGE / module.partition(".")[0])]
 
 
 @cache
 def _digest_of(*folders: Path) -> str:
+    """Digest of all Python files of folders and of the folders in them; 40 files take 2 ms."""
     digest = hashlib.sha256()
-    for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    for path in (path for folder in folders for path in sorted(folder.rglob("*.py"))):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
+
+
+class Identified(Protocol):
+    """What kernels are built for: a problem."""
+
+    @property
+    def identity(self) -> str:
+        """The sha256 over all that they depend on."""
+
+
+def problem_kernels(problem: Identified, robot: object, backend: Backend, cache_folder: Path) -> KernelLibrary:
+    """Return the library of a problem: what is built of it and its robot is cached under the problem's identity."""
+    return KernelLibrary(backend, cache_folder, problem.identity, {"robot": robot, "problem": problem})
 
 
 def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.kernels.grid import GridKernel
-from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
+from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
 from cnpgen.losses.funnel import Funnel, make_funnel
 from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
@@ -19,7 +19,7 @@ from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.problems.load import as_problem
-from cnpgen.problems.problem import Problem, problem_identity
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import flag, number, real_array
@@ -95,8 +95,7 @@ class PlanLoss:
         self._robot = load_robot(self.problem)
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        arguments = {"robot": self._robot, "problem": self.problem}
-        self._kernels = KernelLibrary(chosen, folder, problem_identity(self.problem), arguments)
+        self._kernels = problem_kernels(self.problem, self._robot, chosen, folder)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was built for this process; it is built again when it is needed."""

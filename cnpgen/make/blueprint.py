@@ -109,11 +109,10 @@ def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
         name: [float(x) for x in getattr(robot, name)]
         for name in ("position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
     }
-    urdf = robot.urdf.read_bytes()
     return {
         "name": robot.urdf.stem,
-        "urdf_sha256": hashlib.sha256(urdf).hexdigest(),
-        "urdf": urdf.decode(),
+        "urdf_sha256": hashlib.sha256(robot.urdf_text.encode()).hexdigest(),
+        "urdf": robot.urdf_text,
         "tip": robot.tip,
         "joint_names": list(robot.joint_names),
         "limits": limits,

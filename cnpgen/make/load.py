@@ -14,7 +14,7 @@ from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
-from cnpgen.schema.catalogue import digest_of, load_recipe, read_kind, reference
+from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import is_kind, read_table
@@ -85,16 +85,15 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
-    read = read_table(path, ("dataset", "pipeline"), mistakes)
-    if read is None:
+    table = read_table(path, ("dataset", "pipeline"), mistakes)
+    if table is None:
         return None
-    data, table = read
     if not is_kind("dataset", table) and is_kind("pipeline", table):
         pipeline = read_pipeline(path, mistakes)
         return _wrapped(pipeline) if pipeline else None
     readers: dict[type, Reader] = {Pipeline: reference("pipeline", read_pipeline, path.parent)}
     made = parse(DatasetRecipe, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
-    return made and replace(made, path=path.absolute(), digest=digest_of(data, made.pipeline.digest.encode()))
+    return made and replace(made, path=path.absolute())
 
 
 def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
@@ -105,7 +104,6 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         pipeline=pipeline,
         splits={"train": 90, "validation": 10},
         path=pipeline.path,
-        digest=digest_of(b"", pipeline.digest.encode()),
     )
 
 

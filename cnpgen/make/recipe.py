@@ -10,7 +10,7 @@ from typing import Any
 
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.problems.problem import resolved
+from cnpgen.problems.problem import resolved, without_labels
 from cnpgen.schema.keys import NAME, field
 
 SPLIT_NAME = "^[a-z][a-z0-9_]*$"
@@ -36,7 +36,6 @@ class DatasetRecipe:
     splits: dict[str, int] = field("rows per split", low=1, pattern=SPLIT_NAME)
     license: str = field("licence of the rows", default="CC-BY-4.0")
     path: Path = Path()
-    digest: str = ""
 
 
 def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
@@ -88,9 +87,7 @@ def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
         pipeline: What ``resolved`` made of it.
         urdf: Content of the robot's URDF file.
     """
-    problem = {key: value for key, value in pipeline["problem"].items() if key != "title"}
-    problem["robot"] = {key: value for key, value in problem["robot"].items() if key != "urdf"}
     content = {key: value for key, value in pipeline.items() if key != "title"}
-    content |= {"problem": problem, "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
+    content |= {"problem": without_labels(pipeline["problem"]), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -11,6 +11,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import sample_tops
 from cnpgen.pipelines.stages.stage import Array, Round, Work
 from cnpgen.problems.constraints.constraint import EXACTNESS, End
+from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, dot, subtract
@@ -88,7 +89,7 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
     for constraint in problem.constraint:
         unmet: Scalar = ca.SX(0)
         for condition in constraint.symbolic_at(state, end):
-            if condition.needs <= needs:
+            if symbolic_needs(condition, dq_sx, ddq_sx) <= needs:
                 unmet = unmet + _unmet(condition.g, condition.lower, condition.upper, condition.slack(dtype))
         rows.append(unmet)
     miss = subtract(p, state.kinematics.tip)

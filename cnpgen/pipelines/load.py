@@ -9,7 +9,7 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.load import read_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
-from cnpgen.schema.catalogue import digest_of, load_recipe, read_kind, reference
+from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import read_table
@@ -30,13 +30,12 @@ def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) 
 
 def read_pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
     """Read a pipeline file and append what is wrong with it to ``mistakes``; None if it cannot be used."""
-    read = read_table(path, ("pipeline",), mistakes)
-    if read is None:
+    table = read_table(path, ("pipeline",), mistakes)
+    if table is None:
         return None
-    data, table = read
     readers: dict[type, Reader] = {
         Stage: partial(read_kind, registry.STAGES),
         Problem: reference("problem", read_problem, path.parent),
     }
     made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
-    return made and replace(made, path=path.absolute(), digest=digest_of(data, made.problem.digest.encode()))
+    return made and replace(made, path=path.absolute())

@@ -19,4 +19,3 @@ class Pipeline:
     )
     stage: tuple[Stage, ...] = field("the steps, in order", form="[[stage]] tables")
     path: Path = Path()
-    digest: str = ""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.kernels.library import Backend, KernelLibrary
+from cnpgen.kernels.library import Backend, problem_kernels
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.piece import Block, Piece
@@ -16,7 +16,6 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Array, Round
 from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import EXACTNESS
-from cnpgen.problems.problem import problem_identity
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.field import Field
 
@@ -44,7 +43,7 @@ class PreparedPipeline:
             raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
         problem = pipeline.problem
         robot = load_robot(problem)
-        kernels = KernelLibrary(backend, cache_folder, problem_identity(problem), {"robot": robot, "problem": problem})
+        kernels = problem_kernels(problem, robot, backend, cache_folder)
         self.pipeline = pipeline
         self.block_rows = min(stage.block_rows for stage in pipeline.stage)
         self.context = Context(problem, robot, kernels, dtype)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.curves import landed_path
 from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.model import Model
@@ -60,8 +60,7 @@ def surroundings(record: ProblemRecord, backend: str | None = None) -> Iterator[
     chosen, folder = choose_backend(backend)
     with record.restored() as problem:
         robot = load_robot(problem)
-        kernels = KernelLibrary(chosen, folder, record.digest, {"robot": robot, "problem": problem})
-        yield Surroundings(record, problem, robot, kernels)
+        yield Surroundings(record, problem, robot, problem_kernels(problem, robot, chosen, folder))
 
 
 @dataclass(frozen=True)

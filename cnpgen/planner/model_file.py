@@ -83,7 +83,7 @@ def model_content(model: Model) -> Content:
         "features": list(model.features.blocks),
         "meaning": asdict(model.meaning),
         "rest": list(model.rest),
-        "problem_sha256": model.problem.digest,
+        "problem_sha256": model.problem.comparable_sha256,
     }
     texts = {
         "description": json.dumps(description, indent=1),

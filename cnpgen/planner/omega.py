@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.kernels.library import Backend, KernelLibrary, choose_backend
+from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.curves import FIXED_AT_GOAL
@@ -23,7 +23,7 @@ from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.load import as_problem
 from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.problem import Problem, problem_identity
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema.arguments import integer, number, real_array
 from cnpgen.trajectory.boundary import Boundary
@@ -74,8 +74,7 @@ class Omega:
         self.rate_outputs = spec.rate_control_points
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        arguments = {"robot": load_robot(self.problem), "problem": self.problem}
-        self._kernels = KernelLibrary(chosen, folder, problem_identity(self.problem), arguments)
+        self._kernels = problem_kernels(self.problem, load_robot(self.problem), chosen, folder)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was built for this process; it is built again when it is needed."""

@@ -75,5 +75,5 @@ def _check_said(path: Path, said: Mapping[str, str], model: Model) -> None:
     record = stored_problem(path, said)
     if record is not None:
         check_problem(str(path), record, model)
-    elif said.get("problem_sha256", model.problem.digest) != model.problem.digest:
+    elif said.get("problem_sha256", model.problem.comparable_sha256) != model.problem.comparable_sha256:
         raise DatasetError(f"{path} is of another problem than the model, which plans for {model.problem.name!r}")

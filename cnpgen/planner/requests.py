@@ -99,7 +99,7 @@ def boundary_in(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> 
 
 def check_problem(where: str, found: ProblemRecord, model: Model) -> None:
     """Refuse what is of another problem than the model."""
-    if found.digest != model.problem.digest:
+    if found.comparable_sha256 != model.problem.comparable_sha256:
         differs = ", ".join(found.differences(model.problem)[:4])
         raise DatasetError(
             f"the model plans for {model.problem.name!r}, but {where} is of {found.name!r}: they differ in {differs}"

@@ -66,7 +66,7 @@ class Evaluation:
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
             "problem": record.name,
-            "problem_sha256": record.digest,
+            "problem_sha256": record.comparable_sha256,
             "step_s": self.step,
             **summarise(self.verdicts),
         }

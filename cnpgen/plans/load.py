@@ -124,7 +124,7 @@ def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | N
     if found is None:
         help_ = "set its attribute 'problem' to a name or a file, or pass problem=... (--problem of 'evaluate')"
         raise DatasetError(f"{path} does not say its problem: {help_}")
-    if wanted is not None and found.digest != wanted.digest:
+    if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
         where = ", ".join(found.differences(wanted)[:4])
         raise DatasetError(
             f"{path} has plans of problem {found.name!r}, not of {wanted.name!r}: they differ in {where}"
@@ -151,8 +151,9 @@ def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord |
         record = record_problem(load_problem(name, relative_to=path.parent))
     except RecipeError as error:
         raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
-    if "problem_sha256" in attributes and _text(path, attributes, "problem_sha256") != record.digest:
-        raise DatasetError(f"{path} is of another {name!r}: its problem_sha256 is not this one's, {record.digest}")
+    if "problem_sha256" in attributes and _text(path, attributes, "problem_sha256") != record.comparable_sha256:
+        ours = record.comparable_sha256
+        raise DatasetError(f"{path} is of another {name!r}: its problem_sha256 is not this one's, {ours}")
     return record
 
 
@@ -163,7 +164,7 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
         raise DatasetError(f"{path} has an attribute 'problem_recipe' but no {' and no '.join(missing)}")
     record = ProblemRecord(_text(path, attributes, "problem_recipe"), _text(path, attributes, "problem_urdf"))
     try:
-        same = record.digest == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
+        same = record.comparable_sha256 == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DatasetError(f"{path} is damaged: its problem_recipe is not that of a problem: {error}") from error
     if not same:

@@ -244,7 +244,7 @@ def _parts(boundary: Boundary) -> list[Array | None]:
 
 def _kinds(first: Plans, other: Plans) -> Iterator[tuple[str, Any, Any]]:
     """Yield what must be the same in plans that are joined."""
-    yield "the problem", first.problem.digest, other.problem.digest
+    yield "the problem", first.problem.comparable_sha256, other.problem.comparable_sha256
     yield "the degree", first.degree, other.degree
     for name in ("path_control_points", "rate_control_points"):
         yield f"the shape of a plan's {name}", getattr(first, name).shape[1:], getattr(other, name).shape[1:]

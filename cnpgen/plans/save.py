@@ -83,7 +83,7 @@ def _attributes(plans: Plans) -> dict[str, str | int]:
         "problem": record.name,
         "problem_recipe": record.recipe,
         "problem_urdf": record.urdf,
-        "problem_sha256": record.digest,
+        "problem_sha256": record.comparable_sha256,
         **{name: getattr(plans, name) for name in NOTES},
     }
 

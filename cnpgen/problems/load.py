@@ -1,6 +1,5 @@
 """Problems from files, by name or path, and from what was written down of them."""
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
-from cnpgen.schema.catalogue import digest_of, load_recipe, read_kind
+from cnpgen.schema.catalogue import load_recipe, read_kind
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import read_table
@@ -46,10 +45,9 @@ def as_problem(problem: object) -> Problem:
 
 def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     """Read a problem file and append what is wrong with it to ``mistakes``; None if it cannot be used."""
-    read = read_table(path, ("problem",), mistakes)
-    if read is None:
+    table = read_table(path, ("problem",), mistakes)
+    if table is None:
         return None
-    data, table = read
     where = Place(str(path))
     readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
@@ -57,8 +55,7 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     mistakes.extend(problem_mistakes(table, where, path.parent))
     if problem is None or len(mistakes) > before:
         return None
-    problem = replace(problem, path=path.absolute())
-    return replace(problem, digest=digest_of(data, problem.urdf_path.read_bytes()))
+    return replace(problem, path=path.absolute())
 
 
 def without_defaults(value: Any) -> Any:
@@ -101,8 +98,7 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
         value = {**value, "robot": {**value["robot"], "urdf": "robot.urdf"}}
         readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
-        digest = digest_of(json.dumps(value, sort_keys=True).encode(), urdf.encode())
-        return made and replace(made, path=path, digest=digest)
+        return made and replace(made, path=path)
 
     return read
 

@@ -1,9 +1,11 @@
 """Problem: what a valid motion is, and what identifies it."""
 
+import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,6 @@ class Problem:
 
     Attributes:
         path: The problem file; the URDF is looked up beside it.
-        digest: sha256 of the problem file and its URDF.
     """
 
     name: str = field("name of the problem: lower-case letters, digits and hyphens", pattern=NAME)
@@ -46,7 +47,6 @@ class Problem:
     trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
     objective: Objective = field("what a good motion is", default=Objective())
     path: Path = Path()
-    digest: str = ""
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""
@@ -68,6 +68,26 @@ class Problem:
         """The URDF file."""
         return self.path.parent / self.robot.urdf
 
+    @cached_property
+    def urdf_text(self) -> str:
+        """The URDF, read once: the robot, its kernels and the identity are of one text, whatever becomes of the file.
+
+        Raises:
+            OSError: The file cannot be read.
+            UnicodeDecodeError: It is not in UTF-8.
+        """
+        return self.urdf_path.read_bytes().decode()
+
+    @cached_property
+    def identity(self) -> str:
+        """The sha256 over all that kernels and plans of the problem depend on; what is cached for it has this key.
+
+        It is that of the object, however it was made, and not of a file: a copy with another value has another one.
+        Only the title and the places of the files are left out.
+        """
+        content = json.dumps(without_labels(to_dict(self, label=_all_of)), sort_keys=True)
+        return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
+
 
 def resolved(recipe: object) -> dict[str, Any]:
     """Return a problem, pipeline or dataset recipe as plain dicts and lists in SI units.
@@ -86,8 +106,16 @@ def _use(obj: object) -> dict[str, str]:
     return {"use": registry.name_of(group, type(obj)), **{key: text for key, text in about.items() if text}}
 
 
-def problem_identity(problem: Problem) -> str:
-    """Digest of what kernels are built from: the problem as it is, wherever it came from, and its URDF."""
-    content = resolved(problem)
-    del content["title"], content["robot"]["urdf"]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode() + problem.urdf_path.read_bytes()).hexdigest()
+def _all_of(obj: object) -> dict[str, str]:
+    """Label a kind with its name and code, and with its fields that are no keys: an object made in Python has them."""
+    label = _use(obj)
+    if not label:
+        return {}
+    others = (spec for spec in dataclasses.fields(obj) if "doc" not in spec.metadata)  # type: ignore[arg-type]
+    return label | {spec.name: repr(getattr(obj, spec.name)) for spec in others}
+
+
+def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out of a resolved problem what changes nothing but how it is shown or found: title and name of the URDF."""
+    robot = {key: value for key, value in problem["robot"].items() if key != "urdf"}
+    return {key: value for key, value in problem.items() if key != "title"} | {"robot": robot}

@@ -66,17 +66,18 @@ class ProblemRecord:
         return TrajectorySpec(**self.content["trajectory"])
 
     @cached_property
-    def digest(self) -> str:
-        """The sha256 over what plans of this problem mean.
+    def comparable_sha256(self) -> str:
+        """The sha256 over what problems must share for their plans to be compared: ``problem_sha256`` in files.
 
-        Left out is what may differ between files that can be compared: name and title, the base configuration, the
-        suggested parameterisation, the objective, and by how much constraints may be violated.
+        Left out is what may differ then: name and title, the base configuration, the suggested parameterisation, the
+        objective, and by how much constraints may be violated. So it identifies no problem: that is
+        ``Problem.identity``, the only key under which anything of a problem may be cached.
         """
-        return canonical_sha256(_meaning(self))
+        return canonical_sha256(_comparable(self))
 
     def differences(self, other: "ProblemRecord") -> list[str]:
-        """List the keys in which two problems differ, of those that the digest covers: ``"limits.velocity_scale"``."""
-        return [each.key for each in differences(_meaning(self), _meaning(other))]
+        """List the keys that keep plans of two problems from being compared: ``"limits.velocity_scale"``."""
+        return [each.key for each in differences(_comparable(self), _comparable(other))]
 
     @contextmanager
     def restored(self) -> Iterator[Problem]:
@@ -112,12 +113,12 @@ class ProblemRecord:
 def record_problem(problem: Problem) -> ProblemRecord:
     """Write a problem and its URDF down."""
     recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
-    return ProblemRecord(recipe, problem.urdf_path.read_bytes().decode())
+    return ProblemRecord(recipe, problem.urdf_text)
 
 
 @lru_cache(maxsize=8)
 def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
-    """Rebuild a problem and its robot, which is loaded as far as Pinocchio's model; the files are gone afterwards.
+    """Rebuild a problem and its robot, both hold the URDF; the files are gone afterwards.
 
     Raises:
         RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
@@ -125,13 +126,11 @@ def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
     from cnpgen.problems.robot import load_robot
 
     with record.restored() as problem:
-        robot = load_robot(problem)
-        robot.skeleton  # noqa: B018 - it and the model are read from the URDF when they are first asked for
-    return problem, robot
+        return problem, load_robot(problem)
 
 
-def _meaning(record: ProblemRecord) -> dict[str, Any]:
-    """Reduce a problem to what its plans mean."""
+def _comparable(record: ProblemRecord) -> dict[str, Any]:
+    """Reduce a problem to what problems with comparable plans share."""
     kept = {
         key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}
     }

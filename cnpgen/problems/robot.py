@@ -1,7 +1,6 @@
 """The robot of a problem: the URDF's limits scaled as the problem says, and what does not fit."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,10 +8,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.mimic import check_mimic
-
-if TYPE_CHECKING:
-    pass
-from cnpgen.robots.robot import Robot, _reduced_model
+from cnpgen.robots.robot import Robot, reduced_model
 
 
 def load_robot(problem: Problem) -> Robot:
@@ -23,8 +19,9 @@ def load_robot(problem: Problem) -> Robot:
     """
     spec, limits = problem.robot, problem.limits
     try:
-        check_mimic(problem.urdf_path, spec.joints)
-        model = _reduced_model(problem.urdf_path, spec.joints)
+        urdf = _urdf_text(problem)
+        check_mimic(urdf, spec.joints)
+        model = reduced_model(problem.urdf_path, urdf, spec.joints)
         chain = chain_from_model(model, spec.tip)
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
@@ -33,6 +30,7 @@ def load_robot(problem: Problem) -> Robot:
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
     robot = Robot(
         urdf=problem.urdf_path,
+        urdf_text=urdf,
         joint_names=tuple(spec.joints),
         tip=spec.tip,
         position_lower=middle - half,
@@ -47,6 +45,13 @@ def load_robot(problem: Problem) -> Robot:
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
     return robot
+
+
+def _urdf_text(problem: Problem) -> str:
+    try:
+        return problem.urdf_text
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError([f"{problem.urdf_path}: not a URDF that Pinocchio can read: {error}"]) from error
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import ProblemRecord, open_problem
@@ -122,8 +122,7 @@ def load_refiner(
     from cnpgen.world.state import World
 
     if kernels is None:
-        backend, cache_folder = choose_backend(None)
-        kernels = KernelLibrary(backend, cache_folder, problem.digest, {"robot": robot, "problem": problem})
+        kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
     return Refiner(
         problem,

@@ -1,22 +1,21 @@
 """Joints of a URDF that mimic others: Pinocchio reads them as joints of their own, so most of them are refused."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError
 
 
-def check_mimic(urdf: Path, joints: Sequence[str]) -> None:
+def check_mimic(urdf: str, joints: Sequence[str]) -> None:
     """Raise RecipeError where a joint that mimics another would not stand where its robot has it.
 
     Args:
-        urdf: The URDF file; one that cannot be parsed is left to Pinocchio.
+        urdf: The text of the URDF; one that cannot be parsed is left to Pinocchio.
         joints: The planned joints; all others stay at zero.
     """
     try:
-        tree = ElementTree.parse(urdf)  # noqa: S314 - a user's own file, and expat expands no external entities
-    except (OSError, ElementTree.ParseError):
+        tree = ElementTree.fromstring(urdf.encode())  # noqa: S314 - a user's own file, and expat expands no external entities
+    except (ValueError, ElementTree.ParseError):
         return
     mistakes = [f"robot.joints: {text}" for joint in tree.iter("joint") for text in _mistakes(joint, joints)]
     if mistakes:

@@ -25,7 +25,8 @@ class Robot:
     """What every stage, kernel and check needs to know about the robot of a problem.
 
     Attributes:
-        urdf: The URDF file.
+        urdf: The URDF file, for messages: it may be gone.
+        urdf_text: What was in it.
         joint_names: The n planned joints; every other joint of the URDF stays at zero.
         tip: Name of the frame that the task is about.
         position_lower: Planning limits of joint positions [rad], shape (n,).
@@ -39,6 +40,7 @@ class Robot:
     """
 
     urdf: Path
+    urdf_text: str
     joint_names: tuple[str, ...]
     tip: str
     position_lower: Array
@@ -72,14 +74,24 @@ class Robot:
     @cached_property
     def model(self) -> "pin.Model":
         """The Pinocchio model reduced to the planned joints."""
-        return _reduced_model(self.urdf, self.joint_names)
+        return reduced_model(self.urdf, self.urdf_text, self.joint_names)
 
 
-def _reduced_model(urdf: Path, joints: tuple[str, ...]) -> "pin.Model":
+def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model":
+    """Build the Pinocchio model of a URDF, reduced to the planned joints.
+
+    Args:
+        urdf: The URDF file, for messages.
+        text: What is in it.
+        joints: The planned joints; all others are locked at zero.
+
+    Raises:
+        RecipeError: It is no URDF, or the joints are not in it in this order.
+    """
     import pinocchio as pin
 
     try:
-        model = pin.buildModelFromUrdf(str(urdf))
+        model = pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
     known = list(model.names)[1:]

@@ -1,6 +1,5 @@
 """Recipes by name or path: those that cnpgen ships, anybody's files, and what reads and builds them."""
 
-import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -98,8 +97,3 @@ def read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any:
         return None
     rest = {key: entry for key, entry in value.items() if key != "use"}
     return parse(kind, rest, where=where, mistakes=mistakes)
-
-
-def digest_of(*parts: bytes) -> str:
-    """Return the sha256 of parts one after the other."""
-    return hashlib.sha256(b"".join(parts)).hexdigest()

@@ -24,11 +24,10 @@ def kind_of_file(path: Path) -> Kind:
     return next((kind for kind in MARKS if is_kind(kind, table)), "dataset")
 
 
-def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> tuple[bytes, dict[str, Any]] | None:
-    """Return the bytes of a recipe file and its top-level table, or None after a mistake."""
+def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict[str, Any] | None:
+    """Return the top-level table of a recipe file, or None after a mistake."""
     try:
-        data = path.read_bytes()
-        return data, _expect(kinds, _toml(data))
+        return _expect(kinds, _toml(path.read_bytes()))
     except OSError as error:
         mistakes.append(f"{path}: cannot be read: {error.strerror}")
     except ValueError as error:

@@ -29,6 +29,7 @@ class World:
 
     Attributes:
         robot: The robot.
+        obstacles: The boxes of the world.
         q: Joint positions [rad], shape (n,).
         dq: Joint velocities [rad/s], shape (n,).
         ddq: Joint accelerations [rad/s^2], shape (n,).
@@ -40,7 +41,7 @@ class World:
         obstacles: "Sequence[Obstacle]" = (),
         object_size: tuple[float, float, float] | None = None,
     ) -> None:
-        self.robot = robot
+        self.robot, self.obstacles = robot, obstacles
         self._model = robot.model
         self._data = self._model.createData()
         self._dynamics_data = self._model.createData()  # RNEA's accelerations include gravity: kept apart

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.kit import Surroundings, make_kit
 from cnpgen.planner.landing import make_landing
@@ -29,9 +29,8 @@ def surroundings_of(name: str) -> Surroundings:
 
     problem = PROBLEMS[name]
     robot, (backend, folder) = load_robot(problem), choose_backend()
-    record = record_problem(problem)
-    kernels = KernelLibrary(backend, folder, record.digest, {"robot": robot, "problem": problem})
-    return Surroundings(record, problem, robot, kernels)
+    kernels = problem_kernels(problem, robot, backend, folder)
+    return Surroundings(record_problem(problem), problem, robot, kernels)
 
 
 def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:

@@ -6,7 +6,7 @@ import numpy as np
 
 from cnpgen.judges.plans import Verdict, judge
 from cnpgen.kernels.compiled import find_compiler
-from cnpgen.kernels.library import KernelLibrary, default_cache_folder
+from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.jury import Jury
@@ -24,7 +24,7 @@ from tests.examples.plans import PROBLEMS, ROBOTS, Plan
 def library(name: str) -> KernelLibrary:
     problem, robot = PROBLEMS[name], ROBOTS[name]
     backend = "compiled" if find_compiler() else "numpy"
-    return KernelLibrary(backend, default_cache_folder(), problem.digest, {"robot": robot, "problem": problem})
+    return problem_kernels(problem, robot, backend, default_cache_folder())
 
 
 @cache

@@ -103,8 +103,8 @@ def test_the_digest_ignores_what_does_not_change_the_rows_of_a_seed(recipe, tmp_
     (moved / "renamed.urdf").write_bytes((tmp_path / "arm.urdf").read_bytes())
     problem = recipe.pipeline.problem
     robot = replace(problem.robot, urdf="renamed.urdf")
-    problem = replace(problem, title="x", path=moved / "other.toml", digest="x", robot=robot)
-    assert recipe_digest(changed(recipe, title="x", path=moved, digest="x", problem=problem)) == digest
+    problem = replace(problem, title="x", path=moved / "other.toml", robot=robot)
+    assert recipe_digest(changed(recipe, title="x", path=moved, problem=problem)) == digest
 
 
 def test_the_digest_changes_with_stages_problem_and_urdf(recipe, tmp_path):

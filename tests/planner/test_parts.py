@@ -7,15 +7,19 @@ import pinocchio as pin
 import pytest
 from scipy.interpolate import BSpline
 
+from cnpgen.kernels.library import problem_kernels
+from cnpgen.planner.expressions import count_equalities
 from cnpgen.planner.kit import make_kit
 from cnpgen.planner.slowing import PHASES, SLOWEST, make_slowing
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.trajectory.boundary import anchor_line, assemble
+from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import chebyshev
+from cnpgen.world.state import World
 from tests.conftest import columns_of
+from tests.examples.constraints import TipSpeed
 from tests.examples.models import boundary_of_columns, surroundings_of, untrained_model
 from tests.examples.plans import KNOTS
 
@@ -185,3 +189,28 @@ def test_only_models_of_motions_from_rest_to_rest_slow_down(tiny):
     assert (ratio[:, 0] > 1).any()
     hits = boundary_of_columns(columns_of(tiny("airhockey-hit")), 12)
     assert not untrained_model("airhockey", hits).rests
+
+
+def test_a_plug_ins_limit_of_the_tip_speed_slows_motions_down_and_bends_no_line(tmp_path):
+    given = surroundings_of("airhockey")
+    slow = TipSpeed(highest=0.3)
+    problem = replace(given.problem, constraint=(*given.problem.constraint, slow))
+    assert count_equalities(given.robot, problem) == count_equalities(given.robot, given.problem)
+    q = np.stack([given.robot.base, given.robot.base])
+    q[1, 0] += 0.3
+    rest = np.zeros((1, 6))
+    boundary, rate = Boundary(q[:1], rest, rest, q[1:], rest), np.full((1, 20), 1.0)
+    spec = problem.trajectory
+    motion = Motion(assemble(boundary, anchor_line(boundary, rate, spec), rate, spec), rate, spec.degree)
+    kernels = problem_kernels(problem, given.robot, "numpy", tmp_path)
+    factor = make_slowing(problem, given.robot, kernels).factor(motion, np.empty((1, 0)))
+
+    def fastest(run: Motion) -> float:
+        world, states, found = World(given.robot), run.at(np.linspace(0, 1, 400)), []
+        for state in zip(states.q[0], states.dq[0], states.ddq[0], strict=True):
+            world.set_state(*state, np.empty(0))
+            found.append(float(np.linalg.norm(world.tip_velocity)))
+        return max(found)
+
+    assert 0.3 < fastest(motion) < 3 * 0.3
+    assert fastest(motion.slower(factor)) == pytest.approx(0.3, rel=1e-3)

@@ -72,7 +72,7 @@ def test_a_file_that_names_another_problem_is_refused(tmp_path, model):
         read_file(write(tmp_path / "b.h5", problem="airhokey"), model)
     with pytest.raises(DatasetError, match="of another problem than the model"):
         read_file(write(tmp_path / "c.h5", problem_sha256="0" * 64), model)
-    text = {"problem_recipe": "{}", "problem_urdf": "", "problem_sha256": model.problem.digest}
+    text = {"problem_recipe": "{}", "problem_urdf": "", "problem_sha256": model.problem.comparable_sha256}
     with pytest.raises(DatasetError, match="problem_recipe is not that of a problem"):
         read_file(write(tmp_path / "d.h5", **text), model)
     assert len(read_file(write(tmp_path / "e.h5", problem="airhockey"), model).sample_id) == 2

@@ -115,7 +115,7 @@ def test_a_file_needs_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert restored.name == "mine"
         assert np.allclose(robot.velocity_limit, 0.7 * robot.rated_velocity)
         assert resolved(restored) == resolved(replace(problem, robot=replace(problem.robot, urdf="robot.urdf")))
-    assert found.problem.digest == plans.problem.digest
+    assert found.problem.comparable_sha256 == plans.problem.comparable_sha256
     with pytest.raises(
         DatasetError, match=r"of problem 'mine', not of 'airhockey': they differ in limits.velocity_scale"
     ):
@@ -142,7 +142,7 @@ def test_every_dataset_says_what_it_is(tmp_path: Path) -> None:
         assert file["status"].dtype == "u1"
         assert file.attrs["format"] == b"cnpgen-plans"
         assert file.attrs["problem"] == b"airhockey"
-        assert file.attrs["problem_sha256"].decode() == RECORD.digest
+        assert file.attrs["problem_sha256"].decode() == RECORD.comparable_sha256
 
 
 # --- files of others --------------------------------------------------------------------------------------------------
@@ -212,7 +212,9 @@ def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
     beside = write_minimal(tmp_path / "a.h5", **fields, attributes={"problem": "heavy/problem.toml"})
     unsaid = write_minimal(tmp_path / "b.h5", **fields, attributes={"problem": None})
     assert load_plans(beside).problem.name == "heavy-object"
-    assert load_plans(beside, problem="heavy-object").problem.digest == record_problem(HEAVY).digest
+    assert (
+        load_plans(beside, problem="heavy-object").problem.comparable_sha256 == record_problem(HEAVY).comparable_sha256
+    )
     assert load_plans(unsaid, problem=HEAVY).problem == record_problem(HEAVY)
     with pytest.raises(DatasetError, match=r"b\.h5 does not say its problem: set its attribute 'problem'"):
         load_plans(unsaid)
@@ -254,7 +256,7 @@ def test_constraints_of_one_kind_all_count() -> None:
     twice, others = (once | {"constraint": [*once["constraint"], table | {"x": x}]} for x in (table["x"], [0.9, 1.0]))
     narrow = once | {"constraint": [table | {"x": [0.9, 1.0]}, *once["constraint"]]}
     records = [ProblemRecord(json.dumps(each), RECORD.urdf) for each in (once, twice, others, narrow)]
-    assert len({record.digest for record in records}) == 4
+    assert len({record.comparable_sha256 for record in records}) == 4
     assert records[1].differences(records[2]) == ["constraint.table 2.x"]
 
 
@@ -263,7 +265,7 @@ def test_another_robot_file_is_another_problem() -> None:
     assert other.urdf != RECORD.urdf
     assert RECORD.differences(other) == ["robot.urdf"]
     renamed = json.loads(RECORD.recipe) | {"name": "x", "title": "y", "trajectory": {"degree": 5}}
-    assert ProblemRecord(json.dumps(renamed), RECORD.urdf).digest == RECORD.digest
+    assert ProblemRecord(json.dumps(renamed), RECORD.urdf).comparable_sha256 == RECORD.comparable_sha256
 
 
 @pytest.mark.parametrize(

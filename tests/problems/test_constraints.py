@@ -1,6 +1,8 @@
 """Every kind of constraint: its symbolic form against its measurement, and a met and a violated case of each."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.load import load_problem
@@ -23,6 +26,7 @@ from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
 from cnpgen.symbolic.state import SymbolicState, symbols
 from cnpgen.world.state import World
+from tests.examples.constraints import TipSpeed
 
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
 
@@ -114,8 +118,12 @@ KINDS = {
 }
 
 
+def forms_of(constraint: Constraint) -> list[Callable[[World], tuple[Condition, ...]]]:
+    return [constraint.measured, *(partial(constraint.measured_at, end=end) for end in ("start", "goal"))]
+
+
 def measured_forms(constraint: Constraint, world: World) -> list[tuple[Condition, ...]]:
-    return [constraint.measured(world), *(constraint.measured_at(world, end) for end in ("start", "goal"))]
+    return [form(world) for form in forms_of(constraint)]
 
 
 def values(form: tuple[Condition, ...]) -> np.ndarray:
@@ -165,28 +173,60 @@ def test_both_forms_state_the_same_conditions(benches, name):
     _, forms = bench.symbolic(KINDS[name])
     for symbolic, measured in zip(forms, measured_forms(KINDS[name], bench.state(0.1)), strict=True):
         for a, b in zip(symbolic, measured, strict=True):
-            assert (a.name, a.unit, a.exactness, a.needs, len(a.g)) == (b.name, b.unit, b.exactness, b.needs, len(b.g))
+            assert (a.name, a.unit, a.exactness, len(a.g)) == (b.name, b.unit, b.exactness, len(b.g))
             np.testing.assert_array_equal(a.lower, b.lower)
             np.testing.assert_array_equal(a.upper, b.upper)
             assert len(a.g) == len(a.lower) == len(a.upper)
             assert a.exactness in EXACTNESS["float64"]
 
 
+HIGHEST = {  # the highest derivative of q that the conditions of a kind depend on, at its ends where these are others
+    "joint-position": [0],
+    "joint-velocity": [1],
+    "joint-acceleration": [2],
+    "joint-torque": [2],
+    "table": [0, 0, 1, 2],
+    "vertical": [0, 0],
+    "robot-clearance": [0],
+    "object-contact": [0],
+    "tip-speed": [1],
+}
+
+
+@pytest.mark.parametrize("name", HIGHEST)
+def test_what_conditions_depend_on_is_found_out_from_both_forms(benches, name):
+    bench, kind = benches["heavy-object"], {**KINDS, "tip-speed": TipSpeed()}[name]
+    (_, q), (dq_sx, dq), (ddq_sx, ddq) = (symbols(what, bench.robot.n) for what in ("q", "dq", "ddq"))
+    tops, box = symbols("tops", len(bench.problem.obstacle))[1], bench.problem.object
+    state = SymbolicState(bench.robot, q, dq, ddq, tops, bench.problem.obstacle, box.size)
+    assert [symbolic_needs(each, dq_sx, ddq_sx) for each in kind.symbolic_at(state, "start")] == HIGHEST[name]
+    assert measured_needs([partial(kind.measured_at, end="start")], bench.world) == HIGHEST[name]
+    assert measured_needs([kind.measured], bench.world) == HIGHEST[name][: len(kind.measured(bench.world))]
+
+
 @pytest.mark.parametrize("name", list(KINDS))
-def test_conditions_depend_on_no_higher_derivative_than_they_say(benches, name):
+def test_conditions_depend_on_no_higher_derivative_than_was_found(benches, name):
     bench, random = benches["heavy-object"], np.random.default_rng(6)
+    needs = measured_needs(forms_of(KINDS[name]), bench.world)
     q, dq, ddq, tops = bench.random_state(random)
     forms = []
     for order in (2, 1, 0):
         bench.world.set_state(q, dq if order > 0 else 0 * dq, ddq if order > 1 else 0 * ddq, tops)
         forms.append([c for form in measured_forms(KINDS[name], bench.world) for c in form])
-    for full, no_ddq, still in zip(*forms, strict=True):
-        if full.needs < 2:
+    for full, no_ddq, still, need in zip(*forms, needs, strict=True):
+        if need < 2:
             assert full.g == no_ddq.g
-        if full.needs < 1:
+        if need < 1:
             assert full.g == still.g
         else:
             assert full.g != still.g
+
+
+def test_a_value_that_is_no_number_anywhere_depends_on_nothing(benches):
+    world = benches["airhockey"].world
+    bound = np.zeros(1)
+    lost = Condition("lost", "m", [np.nan], bound, bound, "position")
+    assert measured_needs([lambda _: (lost,), lambda w: (replace(lost, g=[w.ddq[0]]),)], world) == [0, 2]
 
 
 # --- met and violated -------------------------------------------------------------------------------------------------

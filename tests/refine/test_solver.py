@@ -1,16 +1,14 @@
 """The refiner: exact derivatives, plans that the independent verdict calls valid, honest outcomes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Verdict
-from cnpgen.kernels.library import KernelLibrary
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.kernels.library import problem_kernels
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
@@ -24,12 +22,12 @@ from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import Settings, minimise
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Outcome, Refined
-from cnpgen.symbolic.state import SymbolicState
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import chebyshev
 from cnpgen.world.state import World
+from tests.examples.constraints import TipSpeed
 from tests.examples.plans import PROBLEMS, Plan, load, raised
 from tests.examples.refiner import library, refine, refiner, refiner_of, task, tops, verdict
 
@@ -449,26 +447,6 @@ def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radiu
     assert model.solve(held, np.full(motion.nx, radius), relax=True).left <= step.left + 1e-6
 
 
-@dataclass(frozen=True, kw_only=True)
-class TipSpeed(Constraint):
-    """A plug-in's constraint whose residual is no fraction of a limit: the square of the tip's speed."""
-
-    reason = "tip too fast"
-    tolerance: float = 1e-3
-    highest: float = 1.0
-
-    def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
-        return self._slow(state.tip_velocity)
-
-    def measured(self, world: World) -> tuple[Condition, ...]:
-        return self._slow(world.tip_velocity)
-
-    def _slow(self, velocity: Any) -> tuple[Condition, ...]:
-        square = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
-        bounds = np.array([-np.inf]), np.array([self.highest**2])
-        return (Condition("tip speed", "m^2/s^2", [square], *bounds, "velocity", needs=1),)
-
-
 def test_a_slow_down_is_as_large_as_the_bound_asks_for_whatever_its_size(tmp_path: Path) -> None:
     plan = load("transport")
     states = plan.motion.at(np.linspace(0, 1, 500))
@@ -478,7 +456,7 @@ def test_a_slow_down_is_as_large_as_the_bound_asks_for_whatever_its_size(tmp_pat
         fastest = max(fastest, float(np.linalg.norm(world.tip_velocity)))
     limit = TipSpeed(highest=fastest / 1.05)
     problem = replace(plan.problem, constraint=(*plan.problem.constraint, limit))
-    kernels = KernelLibrary("numpy", tmp_path, problem.digest, {"robot": plan.robot, "problem": problem})
+    kernels = problem_kernels(problem, plan.robot, "numpy", tmp_path)
     world = World(plan.robot, problem.obstacle, problem.object_size)
     tool = Refiner(problem, plan.robot, kernels=kernels, world=world, settings=Settings(max_iterations=0))
     jury = Jury(problem, plan.robot, degree=7)

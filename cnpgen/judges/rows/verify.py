@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from cnpgen.judges.rows.diagnostics import ALLOWED, Diagnostic, stored_diagnosti
 from cnpgen.judges.rows.fastest_hit import highest_speed
 from cnpgen.judges.rows.report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition
+from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.world.state import World
 
@@ -150,11 +152,14 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     block = _Block(position, velocity, jacobian, stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):
         (q, dq, ddq), orders = _states(columns, end)
+        forms = [partial(constraint.measured_at, end=end) for constraint in problem.constraint]
+        needs = measured_needs(forms, world)
         for row in finite.tolist():
             world.set_state(q[row], dq[row], ddq[row], tops[row])
             block.position[row, index] = world.tip_position
-            found = chain.from_iterable(c.measured_at(world, end) for c in problem.constraint)
-            _note(block, found, orders[row], (row, index))
+            found = chain.from_iterable(form(world) for form in forms)
+            known = (condition for condition, need in zip(found, needs, strict=True) if need <= orders[row])
+            _note(block, known, (row, index))
             for diagnostic in block.diagnostics:
                 diagnostic.note(world, row, index)
             if end == "goal" and "hit_speed" in columns:
@@ -164,14 +169,12 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     return block
 
 
-def _note(block: _Block, found: Iterator[Condition], order: int, where: tuple[int, int]) -> None:
-    """Keep the conditions that need no higher derivative than is known."""
+def _note(block: _Block, found: Iterator[Condition], where: tuple[int, int]) -> None:
     for condition in found:
-        if condition.needs <= order:
-            key = condition.name, condition.unit, condition.exactness
-            values = block.conditions.get(key) or block.conditions.setdefault(key, _Values())
-            values.found.append(condition)
-            values.where.append(where)
+        key = condition.name, condition.unit, condition.exactness
+        values = block.conditions.get(key) or block.conditions.setdefault(key, _Values())
+        values.found.append(condition)
+        values.where.append(where)
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:

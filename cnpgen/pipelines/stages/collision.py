@@ -36,7 +36,7 @@ class Collision(Stage):
     judge: str = field("what decides: the exact segment test alone, or Coal after it", choices=("segments", "coal"))
 
     @property
-    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+    def needs(self) -> tuple[str, ...]:
         """Configurations, and the positions that the obstacles stand below."""
         return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
 

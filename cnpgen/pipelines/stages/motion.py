@@ -100,7 +100,7 @@ class TableAcceleration(Stage):
     end: str = field("which end", choices=("start", "goal"), default="start")
 
     @property
-    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+    def needs(self) -> tuple[str, ...]:
         """Position and velocity of that end."""
         return f"{self.end}_q", f"{self.end}_dq"
 

@@ -20,7 +20,7 @@ class BallisticReach(Stage):
     goal_time: float = field("how far ahead of the goal, and before it", unit="s", default=0.0, low=0.0)
 
     @property
-    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+    def needs(self) -> tuple[str, ...]:
         """The velocities that are looked at."""
         start = ("start_xyz", "start_tip_velocity") if self.start_time else ()
         return start + (("goal_xyz", "hit_angle", "hit_speed") if self.goal_time else ())

@@ -82,12 +82,15 @@ class Stage(ABC):
     a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.stages``.
 
     Attributes:
-        needs: Columns that earlier stages must have written.
         block_rows: The largest blocks that rows may be made in; a stage that takes long for a row says less.
     """
 
     block_rows: ClassVar[int] = BLOCK_ROWS
-    needs: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Columns that earlier stages must have written; those that depend on no key can be an attribute of a class."""
+        return ()
 
     @abstractmethod
     def describe(self) -> str:

@@ -22,7 +22,7 @@ class GravityTorque(Stage):
     end: str = field("which end", choices=("start", "goal"))
 
     @property
-    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+    def needs(self) -> tuple[str, ...]:
         """The configuration."""
         return (f"{self.end}_q",)
 

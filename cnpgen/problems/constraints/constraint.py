@@ -48,7 +48,6 @@ class Condition:
         lower: Lower bounds, shape (m,), -inf where there is none.
         upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
         exactness: Key of ``EXACTNESS``: how exactly a boundary state must meet it.
-        needs: The highest derivative of q that g depends on: 0, 1 or 2.
     """
 
     name: str
@@ -57,7 +56,6 @@ class Condition:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exactness: str
-    needs: int = 0
 
     @property
     def is_equality(self) -> bool:

@@ -30,8 +30,8 @@ class _RelativeLimit(Constraint):
         return self.tolerance * condition.upper
 
 
-def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64], needs: int) -> tuple[Condition, ...]:
-    return (Condition(name, unit, g, -limit, limit, "limit", needs),)
+def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64]) -> tuple[Condition, ...]:
+    return (Condition(name, unit, g, -limit, limit, "limit"),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +60,11 @@ class JointVelocity(_RelativeLimit):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on dq [rad/s]."""
-        return _within("joint velocity", "rad/s", state.dq, state.robot.velocity_limit, 1)
+        return _within("joint velocity", "rad/s", state.dq, state.robot.velocity_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare dq [rad/s] with the limits."""
-        return _within("joint velocity", "rad/s", list(world.dq), world.robot.velocity_limit, 1)
+        return _within("joint velocity", "rad/s", list(world.dq), world.robot.velocity_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +75,11 @@ class JointAcceleration(_RelativeLimit):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on ddq [rad/s^2]."""
-        return _within("joint acceleration", "rad/s^2", state.ddq, state.robot.acceleration_limit, 2)
+        return _within("joint acceleration", "rad/s^2", state.ddq, state.robot.acceleration_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare ddq [rad/s^2] with the limits."""
-        return _within("joint acceleration", "rad/s^2", list(world.ddq), world.robot.acceleration_limit, 2)
+        return _within("joint acceleration", "rad/s^2", list(world.ddq), world.robot.acceleration_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +90,8 @@ class JointTorque(_RelativeLimit):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on the inverse dynamics [N m]."""
-        return _within("joint torque", "N m", state.torque, state.robot.torque_limit, 2)
+        return _within("joint torque", "N m", state.torque, state.robot.torque_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare Pinocchio's inverse dynamics [N m] with the limits."""
-        return _within("joint torque", "N m", list(world.torque), world.robot.torque_limit, 2)
+        return _within("joint torque", "N m", list(world.torque), world.robot.torque_limit)

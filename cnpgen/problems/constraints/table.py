@@ -72,6 +72,6 @@ class Table(Constraint):
         zero = np.zeros(1)
         return (
             *self._position(tip, self.start_band if end == "start" else 0.0),
-            Condition("vertical velocity", "m/s", [velocity], zero, zero, "velocity", 1),
-            Condition("vertical acceleration", "m/s^2", [acceleration], zero, zero, "acceleration", 2),
+            Condition("vertical velocity", "m/s", [velocity], zero, zero, "velocity"),
+            Condition("vertical acceleration", "m/s^2", [acceleration], zero, zero, "acceleration"),
         )

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable import joint_limits
@@ -41,28 +42,29 @@ def end_mistakes(
         "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),
         "goal": (boundary.goal_q[0], boundary.goal_dq[0], goal_ddq),
     }
+    needs = measured_needs([constraint.measured for constraint in problem.constraint], world)
     world.set_state(*ends["start"], tops)
     tip = world.tip_position
     for end, state in ends.items():
         world.set_state(*state, tops)
         free = end == "goal" and boundary.goal_ddq is None
-        for constraint in problem.constraint:
-            for condition in constraint.measured(world):
-                if not (free and condition.needs == 2):
-                    yield from _broken(constraint, condition, tip, end)
+        found = [(each, condition) for each in problem.constraint for condition in each.measured(world)]
+        for (constraint, condition), need in zip(found, needs, strict=True):
+            if not (free and need == 2):
+                yield from _broken(constraint, condition, tip, end, MARGIN[need])
     if boundary.goal_ddq is None and not _has_acceleration(problem, robot, *ends["goal"][:2]):
         yield "at the goal there is no acceleration within its limits whose torques are within theirs"
 
 
-def _broken(constraint: Constraint, condition: Condition, start_tip: Array, end: str) -> Iterator[str]:
-    """Say whether a measured condition is exceeded by more than its constraint allows."""
+def _broken(constraint: Constraint, condition: Condition, start_tip: Array, end: str, margin: float) -> Iterator[str]:
+    """Say whether a measured condition is exceeded by more than its constraint allows and a margin, see ``MARGIN``."""
     g = np.array(condition.g, float)
     wider = float(constraint.funnel(condition, np.array([0.0 if end == "start" else 1.0]), start_tip)[0])
     bound = np.where(g < condition.lower, condition.lower - wider, condition.upper + wider)
     excess = np.maximum(condition.lower - g, g - condition.upper) - wider
     allowed = constraint.allowed(condition)
     worst = int(np.argmax(excess - allowed))
-    if excess[worst] > allowed[worst] + MARGIN[condition.needs] * max(1.0, abs(bound[worst])):
+    if excess[worst] > allowed[worst] + margin * max(1.0, abs(bound[worst])):
         unit = "" if condition.unit == "1" else f" {condition.unit}"
         yield (
             f"at the {end} {condition.name} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import residual_scale
 
@@ -73,7 +74,7 @@ class BoundsTemplate:
 
     Args:
         problem: The problem.
-        world: Any world of it: the bounds are read off its conditions.
+        world: Any world of it: the bounds are read off its conditions; it is moved.
         s: Phases of the grid, shape (K,).
         tightening: How much to tighten.
 
@@ -87,14 +88,15 @@ class BoundsTemplate:
         pairs = [
             (constraint, condition) for constraint in problem.constraint for condition in constraint.measured(world)
         ]
-        tables = [_bounds(constraint, condition, s, tightening) for constraint, condition in pairs]
+        needs = measured_needs([constraint.measured for constraint in problem.constraint], world)
+        tables = [_bounds(*pair, s, tightening, need) for pair, need in zip(pairs, needs, strict=True)]
         self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._funnels = list(_funnels(pairs))
         self.conditions = [condition for _, condition in pairs]
         self.allowed = np.concatenate([each.allowed(condition) / _scale(each, condition) for each, condition in pairs])
-        self.needs = np.concatenate([np.full(len(each.g), each.needs) for each in self.conditions])
+        self.needs = np.repeat(needs, [len(each.g) for each in self.conditions])
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
         self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs == 2
 
@@ -149,13 +151,15 @@ def _scale(constraint: Constraint, condition: Condition) -> Array:
     return residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
 
 
-def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: Tightening) -> tuple[Array, Array]:
+def _bounds(
+    constraint: Constraint, condition: Condition, s: Array, tightening: Tightening, needs: int
+) -> tuple[Array, Array]:
     """Scaled bounds (K, m) of one condition."""
     scale = _scale(constraint, condition)
     lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
     if condition.exactness == "limit":
-        fraction = tightening.limit if condition.needs == 2 else tightening.gentle
+        fraction = tightening.limit if needs == 2 else tightening.gentle
         shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
         middle, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = middle - shrink * half, middle + shrink * half
@@ -165,6 +169,6 @@ def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: 
     else:
         inside = tightening.clearance * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None] / scale
         lower, upper = lower + inside, upper - inside
-    if condition.needs < 2:  # fixed by the boundary conditions
+    if needs < 2:  # fixed by the boundary conditions
         lower[s == 1], upper[s == 1] = -np.inf, np.inf
     return lower, upper

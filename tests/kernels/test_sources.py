@@ -1,0 +1,121 @@
+"""Cached tapes follow the source that they are built from: every module that a builder imports is in their key."""
+
+import ast
+import shutil
+from pathlib import Path
+
+import casadi as ca
+import pytest
+
+from cnpgen.kernels import library as library_module
+from cnpgen.kernels.library import PACKAGE, ROOMS, KernelLibrary
+from cnpgen.pipelines.stages.braking import tip_state
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
+
+# What builders import and may change without another tape.
+WITHOUT_EFFECT = {
+    "cnpgen.errors": "the words of exceptions",
+    "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
+    "cnpgen.store.field": "how stored columns are described",
+}
+MODULES = {
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in PACKAGE.rglob("*.py")
+}
+
+
+def imports(module: str) -> set[str]:
+    """The package's modules that a module imports at run time, inside functions, too."""
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
+    typing_only = {id(node) for block in blocks for node in ast.walk(block)}
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.update([node.module, *(f"{node.module}.{alias.name}" for alias in node.names)])
+    return found & MODULES.keys()
+
+
+def closure(module: str) -> set[str]:
+    """All of the package's modules that are imported with a module."""
+    seen, waiting = {module}, [module]
+    while waiting:
+        new = imports(waiting.pop()) - seen
+        seen |= new
+        waiting += new
+    return seen
+
+
+def makes_functions(module: str) -> bool:
+    """Whether a module calls ``casadi.Function``, as builders do."""
+    calls = (
+        node.func
+        for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+    )
+    return any(isinstance(call, ast.Attribute) and call.attr == "Function" for call in calls)
+
+
+BUILDERS = sorted(filter(makes_functions, MODULES))
+
+
+def test_the_builders_of_every_room_are_found() -> None:
+    assert {name.split(".")[1] for name in BUILDERS} == {"losses", "pipelines", "planner", "refine"}
+
+
+@pytest.mark.parametrize("module", BUILDERS)
+def test_whatever_a_builder_imports_is_in_the_key_of_its_tapes(module: str) -> None:
+    hashed = tuple(f"cnpgen.{room}" for room in (*ROOMS, module.split(".")[1]))
+    known = tuple(f"{room}." for room in (*hashed, *WITHOUT_EFFECT))
+    left_out = sorted(name for name in closure(module) if not f"{name}.".startswith(known))
+    assert not left_out, f"{module} imports {left_out}, whose change would leave its tapes as they are"
+
+
+@pytest.fixture
+def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the package's source, whose digests are taken instead of the package's."""
+    folder = tmp_path / "cnpgen"
+    shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    monkeypatch.setattr(library_module, "PACKAGE", folder)
+    return folder
+
+
+def tapes(folder: Path) -> set[str]:
+    """The names of the cached tapes after a kernel was loaded, by source as it is now."""
+    library_module._digest_of.cache_clear()
+    KernelLibrary("numpy", folder, "problem", {"robot": load_robot(load_problem("airhockey"))}).load(tip_state)
+    return {path.name for path in (folder / "tape").iterdir()}
+
+
+@pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/braking.py", "robots/chain.py"])
+def test_a_change_in_a_folder_within_a_room_changes_the_key_of_a_tape(copy: Path, tmp_path: Path, changed: str) -> None:
+    before = tapes(tmp_path)
+    assert len(before) == 1
+    with (copy / changed).open("a", encoding="utf-8") as file:
+        file.write("# changed\n")
+    assert len(tapes(tmp_path)) == 2
+
+
+def test_a_change_of_what_no_builder_reads_changes_no_key(copy: Path, tmp_path: Path) -> None:
+    before = tapes(tmp_path)
+    (copy / "cli" / "main.py").write_text("")
+    (copy / "losses" / "terms.py").write_text("")
+    assert tapes(tmp_path) == before
+
+
+def of_a_plug_in() -> ca.Function:
+    """A builder that is not in the package."""
+    x = ca.SX.sym("x")
+    return ca.Function("of_a_plug_in", [x], [2 * x])
+
+
+def test_a_builder_of_a_plug_in_may_use_all_of_the_package(copy: Path) -> None:
+    before = library_module._source_digests(of_a_plug_in)
+    library_module._digest_of.cache_clear()
+    (copy / "cli" / "main.py").write_text("")
+    assert library_module._source_digests(of_a_plug_in)[0] != before[0]
