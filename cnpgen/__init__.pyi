@@ -51,6 +51,7 @@ from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
 from cnpgen.plans.export import Exported as Exported
 from cnpgen.plans.export import export_plans as export_plans
 from cnpgen.plans.load import load_plans as load_plans
+from cnpgen.plans.plans import PlanIndexError as PlanIndexError
 from cnpgen.plans.plans import Plans as Plans
 from cnpgen.plans.plans import make_plans as make_plans
 from cnpgen.plans.save import save_plans as save_plans

@@ -98,7 +98,7 @@ def evaluate_plans(
     """
     check_plans_type(plans)
     check_step(step)
-    parts = [plans.select(slice(first, first + PART)) for first in range(0, len(plans), PART)]
+    parts = [plans[first : first + PART] for first in range(0, len(plans), PART)]
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, len(parts))
     verdicts: list[list[Verdict]] = []
     with closing(share_out(partial(_judge, step=step), parts, count, ordered=True)) as results:

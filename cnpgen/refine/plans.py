@@ -133,7 +133,7 @@ def _run(
     size = PART if count > 1 and options.solver == "own" else 1
     parts = [waiting[first : first + size] for first in range(0, len(waiting), size)]
     prepare(plans, options)  # kernels are compiled once, not by every worker
-    tasks = ((part, plans.select(np.array(part))) for part in parts)
+    tasks = ((part, plans[np.array(part)]) for part in parts)
     advice = "" if journal is None else f": {journal.path} holds what is finished; run the same command again to go on"
     with closing(share_out(partial(_refine, options=options), tasks, count, advice=advice)) as results:
         for part, refined in results:

@@ -130,8 +130,8 @@ def test_planners_models_and_plans_say_in_a_line_what_they_are(planner, rows):
     plans = planned(planner, rows)
     assert repr(plans) == "<40 plans of 'airhockey': 40 unknown>"
     status = np.array([1, 1, 2], np.uint8)
-    assert repr(replace(plans.select(slice(0, 3)), status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
-    assert repr(plans.select(slice(0, 0))) == "<0 plans of 'airhockey'>"
+    assert repr(replace(plans[:3], status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
+    assert repr(plans[:0]) == "<0 plans of 'airhockey'>"
 
 
 @pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])

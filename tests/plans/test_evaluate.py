@@ -70,7 +70,7 @@ def test_tolerances_of_another_problem_file_count(tmp_path: Path) -> None:
 
 
 def test_no_plans_have_no_verdicts() -> None:
-    found = evaluate_plans(plans_of(load("hit")).select(slice(0)))
+    found = evaluate_plans(plans_of(load("hit"))[:0])
     assert found.verdicts == ()
     assert found.valid.shape == found.status.shape == (0,)
     assert found.summary()["valid_ratio"] is None

@@ -36,7 +36,7 @@ def explain(plan: Plan, **changes: np.ndarray) -> Explanation:
 @cache
 def solved(name: str, count: int) -> Plans:
     plans = refine_plans(draw_problems(name, count, seed=8), workers=1)
-    return plans.plans.select(np.flatnonzero(plans.valid))
+    return plans.plans[np.flatnonzero(plans.valid)]
 
 
 def tip_at(name: str, q: np.ndarray) -> np.ndarray:
@@ -280,7 +280,7 @@ def test_boundary_conditions_that_are_no_numbers_are_said_to_be_none() -> None:
 
 
 def test_by_default_the_plans_that_are_not_valid_are_explained() -> None:
-    plans = solved("airhockey-hit", 3).select(np.arange(2))
+    plans = solved("airhockey-hit", 3)[np.arange(2)]
     doubted = replace(plans, status=np.array([1, 2], np.uint8))
     assert list(explain_plans(plans)) == []
     assert list(explain_plans(doubted)) == [1]
@@ -289,7 +289,7 @@ def test_by_default_the_plans_that_are_not_valid_are_explained() -> None:
 
 
 def test_the_commands_explain_plans_that_are_not_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plans = solved("airhockey-hit", 3).select(np.arange(2))
+    plans = solved("airhockey-hit", 3)[np.arange(2)]
     boundary = replace(plans.boundary, goal_dq=plans.boundary.goal_dq * np.array([[1.0], [20.0]]))
     given = tmp_path / "plans.h5"
     save_plans(given, replace(plans, boundary=boundary))

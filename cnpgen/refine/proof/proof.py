@@ -131,7 +131,9 @@ def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Explan
         text = f"{where} is {distance} or more off the table, however the joints are accelerated"
         return Explanation(Feasibility.INFEASIBLE, text)
     room = f"has {distance} of the table left" if found.distance < 0 else f"is {distance} off the table"
-    return Explanation(Feasibility.VERGE, f"{where} {room} at best, as far as a local search without tolerances can tell")
+    return Explanation(
+        Feasibility.VERGE, f"{where} {room} at best, as far as a local search without tolerances can tell"
+    )
 
 
 def _moment(end: str, time: float) -> str:
