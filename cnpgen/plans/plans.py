@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, record_problem
-from cnpgen.schema.arguments import integer
+from cnpgen.problems.record import ProblemRecord, as_record
+from cnpgen.schema.arguments import integer, numbers
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 
@@ -105,7 +106,7 @@ class PlanIndexError(UsageError, IndexError):
 
 
 def make_plans(
-    problem: Problem | ProblemRecord,
+    problem: Problem | ProblemRecord | str | Path,
     boundary: Boundary,
     *,
     path_control_points: ArrayLike,
@@ -118,8 +119,10 @@ def make_plans(
 ) -> Plans:
     """Put plans together; what is not given is computed.
 
+    Everything may be arrays of NumPy or JAX, or tensors of torch on the CPU, whose gradients are left behind.
+
     Args:
-        problem: The problem, or its record.
+        problem: The problem, its record, or the name or the file of a problem, a pipeline or a dataset.
         boundary: Boundary conditions, shape (N, n) each.
         path_control_points: Control points of p(s) [rad], shape (N, C, n).
         rate_control_points: Control points of r(s) [1/s], shape (N, R).
@@ -133,17 +136,17 @@ def make_plans(
     Raises:
         UsageError: Something has the wrong shape.
     """
-    record = problem if isinstance(problem, ProblemRecord) else record_problem(problem)
-    path = _floats("path_control_points", path_control_points)
-    parts = {name: None if part is None else _floats(name, part) for name, part in vars(boundary).items()}
+    record = as_record(problem)
+    path = numbers("path_control_points", path_control_points)
+    parts = {name: None if part is None else numbers(name, part) for name, part in vars(boundary).items()}
     rows = path.shape[0] if path.ndim else 0
     plans = Plans(
         problem=record,
         boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
-        rate_control_points=_floats("rate_control_points", rate_control_points),
+        rate_control_points=numbers("rate_control_points", rate_control_points),
         degree=record.trajectory.degree if degree is None else degree,
-        columns={name: _floats(name, values) for name, values in (columns or {}).items()},
+        columns={name: numbers(name, values) for name, values in (columns or {}).items()},
         sample_id=np.arange(rows) if sample_id is None else _integers("sample_id", sample_id, np.int64),
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
         source=source,
@@ -174,14 +177,6 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
     found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
     return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
-
-
-def _floats(name: str, values: ArrayLike) -> Array:
-    """Return values as an array of floats, nan included."""
-    try:
-        return np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers with rows of equal length: {error}") from error
 
 
 def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:

@@ -33,6 +33,9 @@ class Boundary:
     goal_dq: Array
     goal_ddq: Array | None = None
 
+    def __repr__(self) -> str:
+        return f"<Boundary of shape {np.shape(self.start_q)}>"
+
     @property
     def fixed_at_goal(self) -> int:
         """Number of path control points that the goal fixes (the paper's N_d)."""

@@ -691,3 +691,33 @@ def test_plans_travel_to_other_processes() -> None:
 def test_importing_plans_imports_nothing_heavy() -> None:
     code = "import sys, cnpgen.plans; sys.exit(bool({'h5py', 'scipy', 'pinocchio', 'casadi'} & set(sys.modules)))"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+class Tensor:
+    """What NumPy makes of a tensor that carries a gradient, as torch has it: nothing, until it is detached."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values, self.shape = values, values.shape
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad")
+
+    def detach(self) -> np.ndarray:
+        return self.values
+
+
+def test_plans_are_made_of_tensors_that_carry_gradients() -> None:
+    plans = draw_plans(goal_ddq=True)
+    boundary = Boundary(**{name: Tensor(part) for name, part in vars(plans.boundary).items()})
+    given = {name: Tensor(getattr(plans, name)) for name in ("path_control_points", "rate_control_points")}
+    assert_equal(make_plans(AIRHOCKEY, boundary, **given), plans)
+
+
+def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
+    jnp, torch = pytest.importorskip("jax.numpy"), pytest.importorskip("torch")
+    plans = draw_plans()
+    path, rate = plans.path_control_points, plans.rate_control_points
+    with_gradient = torch.tensor(path, requires_grad=True)
+    found = make_plans(AIRHOCKEY, plans.boundary, path_control_points=with_gradient, rate_control_points=jnp.asarray(rate))
+    np.testing.assert_array_equal(found.path_control_points, path)
+    np.testing.assert_allclose(found.rate_control_points, rate, rtol=1e-6)

@@ -90,6 +90,7 @@ def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[in
         UsageError: There is no plan of such an index.
     """
     from cnpgen.plans.status import PlanStatus
+    from cnpgen.plans.tips import settle_tips
     from cnpgen.problems.record import open_problem
 
     if which is None:
@@ -98,6 +99,7 @@ def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[in
         raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}")
     if not len(which):
         return {}
+    plans = settle_tips(plans)
     problem, robot = open_problem(plans.problem)
     ends = plans.columns["start_xyz"], plans.columns["goal_xyz"]
     return {
