@@ -22,6 +22,7 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
+
 def load_plans(path: str | Path, *, problem: Problem | ProblemRecord | str | Path | None = None) -> Plans:
     """Read plans from a file that cnpgen or anybody else has written.
 
@@ -116,7 +117,7 @@ def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | N
     """Find out which problem the plans are for."""
     found = stored_problem(path, attributes) or wanted
     if found is None:
-        help_ = "set its attribute 'problem' to a name or a file, or pass problem=... (--problem of 'evaluate')"
+        help_ = "set its attribute 'problem' to a name or a file, or pass problem= ('cnpgen evaluate' takes it)"
         raise DatasetError(f"{path} does not say its problem: {help_}")
     if wanted is not None and found.digest != wanted.digest:
         where = ", ".join(found.differences(wanted)[:4])

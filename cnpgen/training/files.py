@@ -26,9 +26,9 @@ def check_beside(out: Path) -> None:
     """
     log, picture = out.with_suffix(LOG), out.with_suffix(PICTURE)
     if log.exists() and not is_log(log):
-        raise UsageError(f"{log} is there and no training log: -o names another model, --force replaces it")
+        raise UsageError(f"{log} is there and no training log: out= names another model, force=True replaces it")
     if picture.exists() and not log.exists():
-        raise UsageError(f"{picture} is there, and of no training run: -o names another model, --force replaces it")
+        raise UsageError(f"{picture} is there, and of no training run: out= names another model, force=True replaces it")
 
 
 def sweep_beside(out: Path) -> None:

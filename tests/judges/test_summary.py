@@ -53,7 +53,11 @@ def test_a_reason_prints_in_the_same_way_whatever_it_is():
     assert kinds == {Reason, str}, "a reason of a constraint and others"
     for verdict in verdicts:
         text = str(verdict.reason)
-        assert (repr(verdict.reason), f"{verdict.reason}", f"{verdict.reason!r:.4}") == (repr(text), text, repr(text)[:4])
+        assert (repr(verdict.reason), f"{verdict.reason}", f"{verdict.reason!r:.4}") == (
+            repr(text),
+            text,
+            repr(text)[:4],
+        )
     assert str([*Reason]) == str([str(reason) for reason in Reason])
 
 

@@ -553,7 +553,9 @@ def test_everything_that_is_known_of_plans_follows_them_as_numpy_would_have_it(w
     assert (found.source, found.refined_with) == ("here", "{}")
     assert set(found.columns) == {"w", "refine_outcome", "start_xyz", "goal_xyz"}
     parts = vars(plans.boundary) | plans.columns | {name: getattr(plans, name) for name in ARRAYS}
-    for name, values in (vars(found.boundary) | found.columns | {name: getattr(found, name) for name in ARRAYS}).items():
+    for name, values in (
+        vars(found.boundary) | found.columns | {name: getattr(found, name) for name in ARRAYS}
+    ).items():
         np.testing.assert_array_equal(values, parts[name][numbers], err_msg=name)
     np.testing.assert_array_equal(found.motion.path, plans.motion[numbers].path)
 
@@ -718,6 +720,8 @@ def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
     plans = draw_plans()
     path, rate = plans.path_control_points, plans.rate_control_points
     with_gradient = torch.tensor(path, requires_grad=True)
-    found = make_plans(AIRHOCKEY, plans.boundary, path_control_points=with_gradient, rate_control_points=jnp.asarray(rate))
+    found = make_plans(
+        AIRHOCKEY, plans.boundary, path_control_points=with_gradient, rate_control_points=jnp.asarray(rate)
+    )
     np.testing.assert_array_equal(found.path_control_points, path)
     np.testing.assert_allclose(found.rate_control_points, rate, rtol=1e-6)

@@ -73,7 +73,9 @@ def test_what_leads_to_no_problem_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("wrong", [None, 3, b"airhockey", [RECORD] * 50, {"problem": "x" * 5000}])
 def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
     for use in (PlanLoss, Omega, as_record):
-        with pytest.raises(UsageError, match="problem must be a Problem, a ProblemRecord, or the name or the") as caught:
+        with pytest.raises(
+            UsageError, match="problem must be a Problem, a ProblemRecord, or the name or the"
+        ) as caught:
             use(wrong)  # type: ignore[operator]
         assert len(str(caught.value)) < 200
 

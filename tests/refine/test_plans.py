@@ -146,13 +146,13 @@ def test_an_interrupted_run_goes_on_where_it_was(
     found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
     assert begun == [(N, 1)]
     assert same(found.plans, solved)
-    with pytest.raises(UsageError, match=r"another run \(options\.tolerance 0\.001, now 0\.002\): --force"):
+    with pytest.raises(UsageError, match=r"another run \(options\.tolerance 0\.001, now 0\.002\): discard=True"):
         refine_plans(problems, workers=1, journal=journal, options=RefineOptions(tolerance=2e-3))
-    with pytest.raises(UsageError, match=r"another run \(options\.weight None, now 2\.0, other plans\): --force"):
+    with pytest.raises(UsageError, match=r"another run \(options\.weight None, now 2\.0, other plans\): discard=True"):
         refine_plans(solved, workers=1, journal=journal, options=RefineOptions(weight=2.0))
     with monkeypatch.context() as patch:
         patch.setattr("cnpgen.refine.plans.__version__", "99.0")
-        with pytest.raises(UsageError, match=r"another run \(version .*, now 99\.0\): --force"):
+        with pytest.raises(UsageError, match=r"another run \(version .*, now 99\.0\): discard=True"):
             refine_plans(problems, workers=1, journal=journal)
 
 
