@@ -61,7 +61,7 @@ def _either(kinds: tuple[Kind, ...]) -> str:
 
 def _hint(text: str, known: Iterable[str]) -> str:
     """Say of what other kind there is a recipe of this name, or which known name is near."""
-    other = next((kind for kind in _LAYOUT if text in list_recipes(kind)), None)
+    other = next((kind for kind in reversed(_LAYOUT) if text in list_recipes(kind)), None)
     return f", which is a {other}" if other else nearest(text, known)
 
 

@@ -36,7 +36,7 @@ def test_python_and_the_shell_are_told_the_same_in_their_own_words(
 ) -> None:
     out = tmp_path / "model.h5"
     out.with_suffix(".jsonl").write_text("mine")
-    with pytest.raises(UsageError, match="no training log: out= names another model, force=True replaces it$"):
+    with pytest.raises(UsageError, match=r"no training log: out= names another model, force=True replaces it$"):
         check_beside(out)
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(out), "--steps", "1"]) == 2  # type: ignore[operator]
     assert "no training log: --out names another model, --force replaces it\n" in capsys.readouterr().err

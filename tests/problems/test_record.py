@@ -64,9 +64,9 @@ def test_what_leads_to_no_problem_is_named(tmp_path: Path) -> None:
     dataset.write_text("pipeline = 3\n")
     with pytest.raises(RecipeError, match=r"hit\.toml: pipeline: expected a name or a path, got 3"):
         as_problem(dataset)
-    with pytest.raises(RecipeError, match="unknown problem, pipeline or dataset 'airhokey-hit' .did you mean 'airho"):
+    with pytest.raises(RecipeError, match=r"unknown problem, pipeline or dataset 'airhokey-hit' .did you mean 'airho"):
         as_problem("airhokey-hit")
-    with pytest.raises(RecipeError, match="unknown problem 'airhockey-hit', which is a pipeline"):
+    with pytest.raises(RecipeError, match="unknown problem 'airhockey-hit', which is a dataset"):
         load_problem("airhockey-hit")
 
 
