@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError, nearest
+from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
@@ -18,8 +18,8 @@ from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
-from cnpgen.problems.load import as_problem
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import flag, number, real_array
@@ -48,12 +48,16 @@ class LossValue:
     path_gradient: Array
     rate_gradient: Array
 
+    def __repr__(self) -> str:
+        return f"<LossValue of {counted(len(self.total), 'plan')}, {self.terms.shape[1]} terms>"
+
 
 class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
 
     Args:
-        problem: The problem, or its name or file.
+        problem: The problem, its record (``plans.problem``), or the name or the file of a problem, a pipeline or a
+            dataset.
         dtype: "float32" or "float64": what is computed with.
         nodes: Number of quadrature nodes.
         rule: Quadrature rule: "cosine" or "gauss".
@@ -74,7 +78,7 @@ class PlanLoss:
 
     def __init__(
         self,
-        problem: Problem | str | Path,
+        problem: Problem | ProblemRecord | str | Path,
         *,
         dtype: Dtype = "float32",
         nodes: int = 64,

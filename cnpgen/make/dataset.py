@@ -231,7 +231,8 @@ def _check(workers: int | None, part: tuple[int, int] | None, *, force: bool) ->
     if part is not None:
         _check_part(part)
     if force and part is not None:
-        raise UsageError("--force would delete what the other parts have made: remove the folder, then start the parts")
+        lost = "what the other parts have made"
+        raise UsageError(f"force=True would delete {lost}: remove the folder, then start the parts")
     source_date()
 
 

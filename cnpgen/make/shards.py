@@ -156,7 +156,7 @@ def spot_check(
         wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)
         raise MachineError(
             f"row {task.first_row + rows[report.out[0]]} of split {task.split!r} fails Pinocchio's check ({wrong}):"
-            f" the {blueprint.backend!r} backend computes wrong numbers on this machine; try another --backend"
+            f" the {blueprint.backend!r} backend computes wrong numbers on this machine; try another backend="
         )
     return {check.name: check.worst for check in report.checks}
 

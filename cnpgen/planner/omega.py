@@ -21,9 +21,9 @@ from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.load import as_problem
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema.arguments import integer, number, real_array
 from cnpgen.trajectory.boundary import Boundary
@@ -39,7 +39,8 @@ class Omega:
     has equalities, line and path are bent onto them, in zero steps in the paper.
 
     Args:
-        problem: The problem, or its name or file.
+        problem: The problem, its record (``plans.problem``), or the name or the file of a problem, a pipeline or a
+            dataset.
         path_scale: What phi is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps that bend the path.
@@ -58,7 +59,7 @@ class Omega:
 
     def __init__(
         self,
-        problem: Problem | str | Path,
+        problem: Problem | ProblemRecord | str | Path,
         *,
         path_scale: float = 0.5,
         bending_steps: int = 1,

@@ -37,6 +37,7 @@ class Planner:
         robot: The robot of its problem.
 
     Raises:
+        UsageError: ``model`` is none, or there is no such file or shipped model.
         CnpgenError: The model cannot be read, or the machine lacks what it needs.
     """
 
@@ -66,9 +67,10 @@ class Planner:
     def plan(
         self,
         start_q: ArrayLike,
+        goal_q: ArrayLike,
+        *,
         start_dq: ArrayLike | None = None,
         start_ddq: ArrayLike | None = None,
-        goal_q: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding, whatever the network gives.
@@ -78,20 +80,18 @@ class Planner:
 
         Args:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
+            goal_q: Goal positions [rad], likewise, as all that follow.
             start_dq: Start velocities [rad/s]; at rest by default.
             start_ddq: Start accelerations [rad/s^2]; none by default.
-            goal_q: Goal positions [rad]; they must be given.
             goal_dq: Goal velocities [rad/s]; at rest by default.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
 
         Raises:
-            UsageError: A shape is wrong, something is missing or not finite, or something moves that was at rest in
+            UsageError: A shape is wrong, something is not finite, or something moves that was at rest in
                 every row that the model was trained on.
         """
-        if goal_q is None:
-            raise UsageError("goal_q is missing: plan(start_q, start_dq, start_ddq, goal_q, goal_dq)")
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
 
     def plan_batch(
@@ -132,7 +132,7 @@ class Planner:
             UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
         """
         q, dq, ddq = states_at(plans, time)
-        return self.plan(q, dq, ddq, goal_q=goal_q, goal_dq=goal_dq)
+        return self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
 
     def _rested(self, boundary: Boundary) -> Boundary:
         """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""

@@ -120,5 +120,5 @@ def check_drawing(where: str, blueprint: Blueprint, model: Model, *, other: bool
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(
         f"the rows of {where} are drawn in another way than those of {name!r} that the model was trained on: the"
-        " recipe has changed since, or it is another one; --other-rows plans for them all the same"
+        " recipe has changed since, or it is another one; other=True plans for them all the same"
     )

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.load import restore_problem
+from cnpgen.errors import UsageError
+from cnpgen.problems.load import load_problem_behind, restore_problem
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.store.files.documents import canonical_sha256, differences, plain
 from cnpgen.trajectory.spec import TrajectorySpec
@@ -37,6 +38,9 @@ class ProblemRecord:
 
     recipe: str
     urdf: str
+
+    def __repr__(self) -> str:
+        return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
 
     @cached_property
     def content(self) -> dict[str, Any]:
@@ -114,6 +118,44 @@ def record_problem(problem: Problem) -> ProblemRecord:
     """Write a problem and its URDF down."""
     recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
     return ProblemRecord(recipe, problem.urdf_text)
+
+
+def as_problem(problem: object) -> Problem:
+    """Return the problem that is meant: itself, what was written down of it, or what a name or a file leads to.
+
+    Args:
+        problem: A problem, its record, or the name or the file of a problem, a pipeline or a dataset.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: There is no such recipe, or with every mistake in the problem's file.
+    """
+    if isinstance(problem, Problem):
+        return problem
+    if isinstance(problem, ProblemRecord):
+        return _rebuilt(problem)
+    if isinstance(problem, str | Path):
+        return load_problem_behind(problem)
+    expected = "a Problem, a ProblemRecord, or the name or the file of a problem, a pipeline or a dataset"
+    raise UsageError(f"problem must be {expected}, got {problem!r:.60}")
+
+
+def as_record(problem: object) -> ProblemRecord:
+    """Return the record of the problem that is meant, by anything that ``as_problem`` takes.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: There is no such recipe, or with every mistake in the problem's file.
+    """
+    return problem if isinstance(problem, ProblemRecord) else record_problem(as_problem(problem))
+
+
+@lru_cache(maxsize=8)
+def _rebuilt(record: ProblemRecord) -> Problem:
+    """Rebuild a problem in a folder that is there until this process ends: its URDF may be asked for at any time."""
+    from cnpgen.kernels.cache import temporary_folder
+
+    return restore_problem(record.content, record.urdf, temporary_folder())
 
 
 @lru_cache(maxsize=8)

@@ -101,7 +101,7 @@ def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Jour
     if journal.finished and not discard:
         raise UsageError(
             f"{path} holds {counted(len(journal.finished), 'finished plan')} of another run"
-            f" ({', '.join(_changed(frames[0], identity))}): --force throws them away, another output keeps them"
+            f" ({', '.join(_changed(frames[0], identity))}): discard=True throws them away, another output keeps them"
         )
     journal.finished.clear()
     file.seek(0)

@@ -51,15 +51,15 @@ def number(name: str, value: Any) -> float:
 
 
 def numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Return an argument as an array of floats, nan and inf included.
+    """Return an argument as an array of floats, nan and inf included; a tensor's gradient is left behind.
 
     Raises:
         UsageError: It holds something else, or rows of different lengths.
     """
     try:
-        return np.asarray(values, np.float64)
+        return np.asarray(values.detach() if hasattr(values, "detach") else values, np.float64)  # torch asks for it
     except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers: {error}") from error
+        raise UsageError(f"{name} must be an array of numbers with rows of equal length: {error}") from error
 
 
 def flag(name: str, value: Any) -> bool:

@@ -29,7 +29,7 @@ _LISTED = (PLAN, STATS, CARD, CROISSANT)
 _NOTHING = "(nothing)"
 
 MAKE_AGAIN = "run the same make-dataset command again: it makes what is damaged or missing and keeps the rest"
-REPLACE = "nothing else says what the dataset was to be: make it again with --force"
+REPLACE = "nothing else says what the dataset was to be: make it again with 'make-dataset --force'"
 DELETE = "delete such a shard and the .json beside it, then run the same make-dataset command again"
 REMOVE = "move elsewhere what is not part of the dataset"
 

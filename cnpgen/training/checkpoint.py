@@ -62,7 +62,7 @@ class Checkpoints:
         if changed:
             raise UsageError(
                 f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to go"
-                " on with it, or --force to throw it away"
+                " on with it, or force=True to throw it away"
             )
         return state
 

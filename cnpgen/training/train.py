@@ -140,7 +140,7 @@ def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: TrainingLog, 
 
 def _finished(job: _Job) -> Trained:
     """Return the model that is there if it is the one that was asked for."""
-    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with --force"
+    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with force=True"
     try:
         model = load_model(path)
     except DatasetError as error:

@@ -39,6 +39,9 @@ class Boundary:
         """Take boundary conditions out of columns, name -> values of shape (N, n): rows of a dataset, for example."""
         return cls(**{each.name: columns[each.name] for each in fields(cls) if each.name in columns})
 
+    def __repr__(self) -> str:
+        return f"<Boundary of shape {np.shape(self.start_q)}>"
+
     @property
     def fixed_at_goal(self) -> int:
         """Number of path control points that the goal fixes (the paper's N_d)."""

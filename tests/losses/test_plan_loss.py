@@ -231,7 +231,7 @@ def test_a_problem_may_be_named_and_nothing_else_is_one():
     assert PlanLoss("airhockey").terms == loss("airhockey").terms
     with pytest.raises(CnpgenError, match="did you mean 'airhockey'"):
         PlanLoss("airhokey")
-    with pytest.raises(CnpgenError, match=r"problem must be the name of a problem, .* got None"):
+    with pytest.raises(CnpgenError, match=r"problem must be a Problem, a ProblemRecord, or the name .* got None"):
         PlanLoss(None)
 
 

@@ -162,7 +162,7 @@ def test_parts_share_no_shard_and_leave_none(job, m):
 def test_force_would_delete_what_other_parts_made(tiny, tmp_path):
     folder = Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "out"))
     before = snapshot(folder)
-    with pytest.raises(UsageError, match="--force would delete what the other parts have made"):
+    with pytest.raises(UsageError, match="force=True would delete what the other parts have made"):
         make_tiny(folder, part=(0, 2), force=True)
     assert snapshot(folder) == before
 
@@ -184,7 +184,7 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
             yield columns, fates
 
     monkeypatch.setattr(make, "shard_columns", wrong)
-    with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another --backend"):
+    with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend="):
         make_tiny(tmp_path / "out")
     assert not digests(tmp_path / "out")
 

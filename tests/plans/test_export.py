@@ -78,7 +78,7 @@ def test_every_form_holds_the_plans_as_they_are(tmp_path: Path, form: Any, rate:
         assert np.all(np.diff(t) > 0)
         assert np.allclose(t[:-1], np.arange(len(t) - 1) / rate, atol=1e-9)
         assert 0.009 / rate < t[-1] - t[-2] < 1.0101 / rate
-        motion = plans.select(np.array([index])).motion
+        motion = plans[np.array([index])].motion
         states = motion.at(motion.phase_at(t[None]))
         for name in values.keys() - {"t"}:
             expected = getattr(states, name)[0]
@@ -192,11 +192,11 @@ def test_plans_of_a_million_samples_or_less_than_a_nanosecond_are_refused(tmp_pa
 
 @pytest.mark.parametrize("form", FORMS)
 def test_if_no_plan_can_be_exported_nothing_is_written(tmp_path: Path, form: Any) -> None:
-    bad = garbage().select(np.arange(1, 9))
+    bad = garbage()[np.arange(1, 9)]
     with pytest.raises(DatasetError, match=r"none of the 8 plans can be exported: plan 0 \(sample 1\): a boundary"):
         export_plans(bad, tmp_path / "out", to=form)
     with pytest.raises(DatasetError, match=r"none of the 0 plans can be exported$"):
-        export_plans(bad.select(np.zeros(8, bool)), tmp_path / "out", to=form)
+        export_plans(bad[np.zeros(8, bool)], tmp_path / "out", to=form)
     assert not (tmp_path / "out").exists()
 
 

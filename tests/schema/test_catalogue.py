@@ -362,6 +362,8 @@ def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
     [
         ("rol", r"unknown pipeline 'rol' \(did you mean 'roll'\?\); known: roll"),
         ("", "unknown pipeline ''; known: roll"),
+        ("arm", "unknown pipeline 'arm', which is a problem; known: roll"),
+        ("roll-1k", "unknown pipeline 'roll-1k', which is a dataset; known: roll"),
         ("rolll.toml", r"no such file: rolll.toml \(did you mean 'roll'\?\)"),
         ("some/roll", "no such file: some/roll"),
         ("/", "/ is a folder, expected a .toml file"),
