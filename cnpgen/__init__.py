@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from cnpgen.refine.proof.proof import explain_plans
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.store.inspection import inspect_dataset
-    from cnpgen.store.reader import open_dataset
     from cnpgen.training.settings import TrainingSettings
     from cnpgen.training.train import train_model
     from cnpgen.trajectory.boundary import Boundary
@@ -80,7 +79,6 @@ _HOME = {
     "make_dataset": "make.dataset",
     "make_plans": "plans.plans",
     "obstacle_tops": "problems.obstacles",
-    "open_dataset": "store.reader",
     "refine_plans": "refine.plans",
     "rotating_shift": "losses.quadrature",
     "save_plans": "plans.save",
@@ -127,7 +125,6 @@ __all__ = [
     "make_dataset",
     "make_plans",
     "obstacle_tops",
-    "open_dataset",
     "refine_plans",
     "rotating_shift",
     "save_plans",
