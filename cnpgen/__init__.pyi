@@ -82,7 +82,6 @@ from cnpgen.store.fates import Fates as Fates
 from cnpgen.store.inspection import Inspection as Inspection
 from cnpgen.store.inspection import inspect_dataset as inspect_dataset
 from cnpgen.store.reader import StoredDataset as StoredDataset
-from cnpgen.store.reader import open_dataset as open_dataset
 from cnpgen.store.record import ShardRecord as ShardRecord
 from cnpgen.store.statistics import FieldStatistics as FieldStatistics
 from cnpgen.store.summary import Summary as Summary

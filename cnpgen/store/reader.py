@@ -133,12 +133,12 @@ def _of_sidecar(folder: Path, task: ShardTask) -> tuple[int, str]:
     return record.bytes, record.sha256
 
 
-def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDataset:
+def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:
     """Open a dataset for reading.
 
     Args:
         folder: Its folder.
-        allow_partial: Open it even if it is unfinished.
+        allow_incomplete: Open it even if it is unfinished.
 
     Raises:
         UsageError: There is no such folder.
@@ -155,6 +155,6 @@ def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDa
                 f"{folder / MANIFEST} is of another blueprint than {PLAN}: the folder mixes two datasets"
             )
         return StoredDataset(folder, blueprint, manifest)
-    if not allow_partial:
-        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_partial=True))}")
+    if not allow_incomplete:
+        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_incomplete=True))}")
     return StoredDataset(folder, blueprint, None)
