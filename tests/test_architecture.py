@@ -133,10 +133,16 @@ def test_the_symbolic_form_of_a_constraint_is_built_only_where_it_is_asked_for()
 
 def test_every_file_has_a_reader() -> None:
     """What nothing imports is left over; kinds are found by their names, and faces and bridges are for users."""
-    used = {target for module in MODULES for target in modules_of(imports(module))}
+    used = {target for module in MODULES for target in modules_of(imports(module))} | modules_of(public_modules())
     by_name = {value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()}
     left = {own for own, module in NAMES.items() if own not in used | by_name and module.name != "__init__"}
     assert left <= {"__main__", "plugins", *BRIDGES}
+
+
+def public_modules() -> set[str]:
+    """The modules of the names that users type, as the package's stub lists them."""
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    return {str(node.module) for node in stub.body if isinstance(node, ast.ImportFrom)}
 
 
 def kinds_by_name() -> set[str]:
