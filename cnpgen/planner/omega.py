@@ -160,8 +160,19 @@ class Omega:
             each[lost] = 0
         return found
 
-    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> Plans:
-        """Make plans of what a network says, to be evaluated, refined or saved."""
+    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, sample_id: ArrayLike | None = None) -> Plans:
+        """Make plans of what a network says, to be evaluated, refined or saved.
+
+        Args:
+            tasks: As for the control points.
+            phi: Likewise.
+            log_rate: Likewise.
+            sample_id: Which rows of a dataset the tasks are, shape (N,): ``batch["sample_id"]``, after shuffling, too;
+                0, 1, ... by default.
+
+        Raises:
+            UsageError: A shape is wrong, or something is no real number.
+        """
         points = self(tasks, phi, log_rate)
         return make_plans(
             self.problem,
@@ -169,6 +180,7 @@ class Omega:
             path_control_points=points.path,
             rate_control_points=points.rate,
             columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            sample_id=sample_id,
         )
 
     def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:
