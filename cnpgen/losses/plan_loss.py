@@ -131,7 +131,7 @@ class PlanLoss:
             gradient: Whether gradients are wanted; without, theirs are arrays of no plan, shape (0, C, n) and (0, R).
 
         Raises:
-            UsageError: A shape is wrong, something is no real number, a weight is negative or not finite, or of no term.
+            UsageError: A shape is wrong, something is no real number, or a weight is negative, infinite or of no term.
         """
         gradient, shift = flag("gradient", gradient), number("shift", shift)
         batch = check_batch(self.problem, path, rate, tops, start_tip, dtype=self.dtype)

@@ -57,7 +57,7 @@ def test_a_message_is_what_ros_expects_of_a_joint_trajectory(run: Run, hits: Pat
     plan = load("hit")
     code, out, _ = run(hits, "--to", "joint-trajectory", "--rate", 250, "--plan", "1")
     assert (code, out) == (0, "hits-joint-trajectory\n")
-    (path,) = Path("hits-joint-trajectory").iterdir()
+    (path,) = Path("hits-joint-trajectory").glob("*.json")
     assert path.name == "plan_00001.json"
     message = json.loads(path.read_text(encoding="utf-8"))
     assert message["joint_names"] == list(plan.problem.robot.joints)
@@ -74,7 +74,7 @@ def test_a_message_is_what_ros_expects_of_a_joint_trajectory(run: Run, hits: Pat
 
 def test_plans_are_chosen_by_index_or_by_sample(run: Run, hits: Path) -> None:
     assert run(hits, "--to", "csv", "-o", "a", "--plan", "0,2-3")[0] == 0
-    assert sorted(path.name for path in Path("a").iterdir()) == [f"plan_0000{index}.csv" for index in (0, 2, 3)]
+    assert sorted(path.name for path in Path("a").glob("*.csv")) == [f"plan_0000{index}.csv" for index in (0, 2, 3)]
     assert run(hits, "--to", "csv", "-o", "b", "--sample", "11")[0] == 0
     assert sorted(path.name for path in Path("b").iterdir()) == ["plan_00001.csv", "plan_00003.csv"]
     assert run(hits, "--to", "csv", "-o", "c", "--sample", "10", "--plan", "3")[0] == 0
