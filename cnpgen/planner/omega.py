@@ -21,6 +21,7 @@ from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem, problem_identity
 from cnpgen.problems.record import ProblemRecord, as_problem
@@ -108,7 +109,9 @@ class Omega:
         for name, array in arrays.items():
             if array.shape != shape:
                 raise UsageError(f"{name} must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}")
-        return self._built[0](Boundary(**arrays))
+        checked = Boundary(**arrays)
+        warn_of_far_joints(self._kernels.arguments["robot"], checked)
+        return self._built[0](checked)
 
     def tops(self, tasks: Tasks) -> Array:
         """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""

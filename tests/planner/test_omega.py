@@ -150,3 +150,9 @@ def test_boundary_conditions_are_taken_out_of_rows_in_their_units(tiny: Any) -> 
         UsageError, match="the batch lacks start_ddq, goal_dq: it has the fields start_q, start_dq, goal_q"
     ):
         Boundary.from_batch({name: rows[name] for name in ("start_q", "start_dq", "goal_q")}, None)
+
+
+def test_joint_positions_in_degrees_are_said_to_be_suspicious(omegas: Any) -> None:
+    given = boundary("airhockey", 4)
+    with pytest.warns(UserWarning, match="goal_q of plan 0: joint_. = .* rad is far outside of its limits"):
+        omegas["airhockey"].tasks(replace(given, goal_q=np.degrees(given.goal_q)))
