@@ -23,6 +23,7 @@ INNER = {  # classes that public signatures name, but that nobody is meant to ma
     "Cut": "made by Dataset.batches",
     "Form": "made by Dataset.batches",
     "Position": "made by Dataset.batches",
+    "Scaling": "what Boundary.from_batch needs of a Normalization",
     "Shard": "what Dataset reads rows from",
     "ShardReader": "likewise",
     "SplitShards": "likewise",

@@ -67,7 +67,7 @@ class CertifiedPlan(Stage):
         def run(batch: Round, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in batch.columns.items()}
             with one_thread():
-                found = solve(Boundary.from_columns(columns), columns["start_xyz"], columns["goal_xyz"])
+                found = solve(Boundary.from_batch(columns, None), columns["start_xyz"], columns["goal_xyz"])
             _write(batch, found, context.problem.trajectory, context.robot.n)
 
         return run

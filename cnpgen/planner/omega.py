@@ -21,6 +21,7 @@ from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, as_problem
@@ -107,7 +108,9 @@ class Omega:
         for name, array in arrays.items():
             if array.shape != shape:
                 raise UsageError(f"{name} must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}")
-        return self._built[0](Boundary(**arrays))
+        checked = Boundary(**arrays)
+        warn_of_far_joints(self._kernels.arguments["robot"], checked)
+        return self._built[0](checked)
 
     def tops(self, tasks: Tasks) -> Array:
         """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""
@@ -159,8 +162,19 @@ class Omega:
             each[lost] = 0
         return found
 
-    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> Plans:
-        """Make plans of what a network says, to be evaluated, refined or saved."""
+    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, sample_id: ArrayLike | None = None) -> Plans:
+        """Make plans of what a network says, to be evaluated, refined or saved.
+
+        Args:
+            tasks: As for the control points.
+            phi: Likewise.
+            log_rate: Likewise.
+            sample_id: Which rows of a dataset the tasks are, shape (N,): ``batch["sample_id"]``, after shuffling, too;
+                0, 1, ... by default.
+
+        Raises:
+            UsageError: A shape is wrong, or something is no real number.
+        """
         points = self(tasks, phi, log_rate)
         return make_plans(
             self.problem,
@@ -168,6 +182,7 @@ class Omega:
             path_control_points=points.path,
             rate_control_points=points.rate,
             columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            sample_id=sample_id,
         )
 
     def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:

@@ -15,6 +15,7 @@ from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.moment import states_at_times
 
@@ -76,7 +77,8 @@ class Planner:
         """Plan motions; boundary conditions hold to rounding, whatever the network gives.
 
         Boundary conditions are not judged: of a start or goal outside of the limits or off the table comes a plan that
-        goes there, and ``evaluate_plans`` says that it is not valid.
+        goes there, and ``evaluate_plans`` says that it is not valid. Only where a joint is so far outside that its
+        position is probably in degrees, or normalised, there is a warning.
 
         Args:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
@@ -113,6 +115,7 @@ class Planner:
         """
         if boundary.goal_ddq is not None:
             raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
+        warn_of_far_joints(self.robot, boundary)
         return self._kit.plan(self.model, self._rested(boundary), sample_id=sample_id, columns=columns)
 
     def replan(self, plans: Plans, time: ArrayLike, *, goal_q: ArrayLike, goal_dq: ArrayLike | None = None) -> Plans:

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_record
+from cnpgen.problems.record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.arguments import integer, numbers
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
@@ -133,6 +134,9 @@ def make_plans(
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
         source: Where they are from, a line of text.
 
+    Warns:
+        UserWarning: A joint position is so far outside of its limits that it is probably in degrees, or normalised.
+
     Raises:
         UsageError: Something has the wrong shape.
     """
@@ -151,6 +155,7 @@ def make_plans(
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
         source=source,
     )
+    warn_of_far_joints(open_problem(record)[1], plans.boundary)
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
     return replace(plans, columns={**plans.columns, **missing})

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_MOVING = ("revolute", "continuous", "prismatic")
 _JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
 
 
@@ -63,6 +65,13 @@ class ProblemRecord:
     def joint_names(self) -> tuple[str, ...]:
         """The n planned joints."""
         return tuple(self.content["robot"]["joints"])
+
+    @property
+    def held_joints(self) -> dict[str, float]:
+        """Joints of the URDF that move and are not planned -> where they stay [rad or m]: at zero."""
+        joints = ElementTree.fromstring(self.urdf.encode()).iter("joint")  # noqa: S314 - expat expands no external entity
+        moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
+        return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
 
     @property
     def trajectory(self) -> TrajectorySpec:

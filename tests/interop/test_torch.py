@@ -413,7 +413,8 @@ def test_weights_and_heights_may_be_arrays_and_any_float_type_is_taken(loss: Any
     of, given = loss("heavy-object", "float32"), plans("heavy-object", 3, torch.float32)
     expected = plan_loss(of, **given)[0]
     arrays = given | {name: given[name].numpy() for name in ("weights", "tops")}
-    for changed in (arrays, given | {"weights": given["weights"].tolist()}):
+    by_name = dict(zip(of.terms[1:], given["weights"].tolist(), strict=True))
+    for changed in (arrays, given | {"weights": given["weights"].tolist()}, given | {"weights": by_name}):
         torch.testing.assert_close(plan_loss(of, **changed)[0], expected)
     for dtype in (torch.bfloat16, torch.float16, torch.float64):
         path = given["path"].to(dtype).requires_grad_()
@@ -455,6 +456,7 @@ MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": torch.ones(1, 20)},
     "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
+    "weights: there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "path must be real numbers, got torch.complex64": {"path": torch.ones(2, 15, 6, dtype=torch.complex64)},
     "start_tip must have shape (2, 3), got (3,)": {"start_tip": torch.zeros(3)},
     "shift must be a finite number, got None": {"shift": None},

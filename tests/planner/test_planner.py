@@ -199,3 +199,10 @@ def test_plans_are_the_same_on_every_backend(planner, rows, backend):
     np.testing.assert_allclose(
         planned(other, rows).path_control_points, planned(planner, rows).path_control_points, atol=1e-5
     )
+
+
+def test_joint_positions_in_degrees_are_said_to_be_suspicious(planner, rows):
+    with pytest.warns(
+        UserWarning, match="start_q of plan 0: joint_2 = 40 rad is far outside of its limits, .* degrees"
+    ):
+        planner.plan(np.array([0, 40.0, 0, -30, 0, 110]), rows.goal_q[0])

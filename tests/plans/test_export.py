@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.plans import Plans
 from cnpgen.plans.export import FORMS, Exported, export_plans
 from cnpgen.plans.formats import sample_plan
+from cnpgen.problems.load import load_problem
 from cnpgen.trajectory.motion import Motion
 from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
 
@@ -94,7 +96,33 @@ def test_npz_says_which_plans_and_samples_there_are(tmp_path: Path) -> None:
     with np.load(exported.files[0]) as data:
         assert data["plan"].tolist() == [0, 9]
         assert data["sample_id"].tolist() == [0, 99]
-        assert len(data.files) == 3 + 2 * 5
+        assert len(data.files) == 5 + 2 * 5
+
+
+@pytest.mark.parametrize(
+    ("name", "held"),
+    [("airhockey", {"joint_7": 0.0, "striker_joint_1": 0.0, "striker_joint_2": 0.0}), ("heavy-object", {})],
+)
+def test_exports_say_where_the_joints_stay_that_are_not_planned(
+    tmp_path: Path, name: str, held: dict[str, float]
+) -> None:
+    plans = draw_plans(problem=load_problem(name), n=2)
+    model = pin.buildModelFromXML(plans.problem.urdf)
+    planned = set(plans.problem.joint_names)
+    assert {each for each in [*model.names][1:] if each not in planned} == set(held)
+    with np.load(export_plans(plans, tmp_path / "a.npz", to="npz", rate=50).files[0]) as data:
+        names, positions = data["held_joint_names"].tolist(), data["held_joint_positions"].tolist()
+        assert dict(zip(names, positions, strict=True)) == held
+    for form in ("csv", "joint-trajectory"):
+        exported = export_plans(plans, tmp_path / form, to=form, rate=50)  # type: ignore[arg-type]
+        if not held:
+            assert exported.held_joints is None
+            assert sorted((tmp_path / form).iterdir()) == sorted(exported.files)
+            continue
+        assert exported.held_joints == tmp_path / form / "held_joints.yaml"
+        lines = exported.held_joints.read_text().splitlines()
+        assert json.loads("{" + ",".join(lines) + "}") == held
+    assert export_plans(plans, tmp_path / "b.npz", to="npz", rate=50).held_joints is None
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -727,3 +727,28 @@ def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
     )
     np.testing.assert_array_equal(found.path_control_points, path)
     np.testing.assert_allclose(found.rate_control_points, rate, rtol=1e-6)
+
+
+@pytest.mark.parametrize("end", ["start_q", "goal_q"])
+def test_joint_positions_in_degrees_are_said_to_be_suspicious_where_they_come_in(tmp_path: Path, end: str) -> None:
+    plans = draw_plans()
+    degrees = getattr(plans.boundary, end).copy()
+    degrees[2, 3] = 40.0
+    boundary = replace(plans.boundary, **{end: degrees})
+    points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
+    said = rf"^{end} of plan 2: joint_4 = 40 rad is far outside of its limits, \[-2\.09, 2\.09\]: .* degrees"
+    with pytest.warns(UserWarning, match=said):
+        made = make_plans(AIRHOCKEY, boundary, **points)
+    save_plans(tmp_path / "degrees.h5", made)
+    with pytest.warns(UserWarning, match=said):
+        load_plans(tmp_path / "degrees.h5")
+
+
+@pytest.mark.parametrize("value", [2.5, 3.9, np.nan])
+def test_joint_positions_that_are_only_outside_are_not_suspicious(value: float) -> None:
+    plans = draw_plans()
+    q = plans.boundary.start_q.copy()
+    q[0, 3] = value
+    boundary = replace(plans.boundary, start_q=q)
+    points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
+    assert len(make_plans(AIRHOCKEY, boundary, **points)) == N  # warnings are errors in tests

@@ -90,7 +90,10 @@ def test_boundary_conditions_beyond_all_measure_leave_the_other_plans_alone(
 ) -> None:
     few, b = problems[np.arange(3)], problems.boundary[:3]
     huge = replace(b, start_q=b.start_q * [[size], [1], [1]], goal_dq=b.goal_dq * [[1], [1], [size]])
-    found = refine_plans(replace(few, boundary=huge), workers=1)
+    with pytest.warns(
+        RuntimeWarning, match="start_xyz of 1 plan is not where start_q puts the tip .the first is plan 0"
+    ):
+        found = refine_plans(replace(few, boundary=huge), workers=1)
     assert found.valid.tolist() == [False, True, False]
     assert same(found.plans[np.array([1])], solved[np.array([1])])
 

@@ -43,7 +43,7 @@ def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[An
     motion = Motion(
         columns["path_control_points"].reshape(rows, -1, robot.n), columns["rate_control_points"], spec.degree
     )
-    boundary = Boundary.from_columns(columns)
+    boundary = Boundary.from_batch(columns, None)
     verdicts = judge(problem, robot, motion, boundary, columns["start_xyz"], columns["goal_xyz"])
     wrong = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
     problems = []
