@@ -163,7 +163,7 @@ def columns_of(folder: Path, split: str = "train") -> dict[str, np.ndarray]:
     """Read all rows of a split."""
     from cnpgen.store.reader import open_dataset
 
-    return open_dataset(folder, allow_partial=True).read(split)
+    return open_dataset(folder, allow_incomplete=True).read(split)
 
 
 @pytest.fixture

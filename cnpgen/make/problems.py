@@ -66,13 +66,14 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
         DatasetError: The folder holds no readable dataset.
         UsageError: There is no such folder or split, or it has no such rows.
     """
+    from cnpgen.store.paths import no_split
     from cnpgen.store.reader import open_dataset
 
     start = integer("start", start, least=0)
     n = None if n is None else integer("n", n, least=1)
     dataset = open_dataset(Path(folder))
     if split not in dataset.blueprint.splits:
-        raise UsageError(f"{folder} has no split {split!r}: expected one of {', '.join(dataset.blueprint.splits)}")
+        raise UsageError(no_split(Path(folder), split, dataset.blueprint.splits))
     rows = dataset.blueprint.splits[split]
     stop = rows if n is None else start + n
     if not 0 <= start < stop <= rows:

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, UsageError, nearest
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.files.documents import canonical_sha256
+from cnpgen.store.paths import no_split
 from cnpgen.store.reader import open_dataset
 from cnpgen.trajectory.boundary import Boundary
 
@@ -61,7 +62,7 @@ def read_rows(
     dataset = open_dataset(folder)
     check_drawing(str(folder), dataset.blueprint, model, other=other)
     if split not in dataset.blueprint.splits:
-        raise UsageError(f"{folder} has no split {split!r}{nearest(split, dataset.blueprint.splits)}")
+        raise UsageError(no_split(folder, split, dataset.blueprint.splits))
     rows = dataset.blueprint.splits[split]
     stop = rows if n is None else first + n
     if not 0 <= first < stop <= rows:

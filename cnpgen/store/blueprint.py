@@ -1,5 +1,6 @@
 """The plan of a dataset: everything that determines its bytes, written before the first shard and never changed."""
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -43,6 +44,22 @@ class ShardTask:
     def sidecar(self) -> str:
         """Path of the shard's commit record, relative to the dataset's folder."""
         return shard_stem(self.split, self.index) + ".json"
+
+
+@dataclass(frozen=True)
+class StoredProblem:
+    """The problem that a dataset was made for, as text; ``PlanLoss``, ``Omega`` and the like take it.
+
+    Attributes:
+        recipe: The resolved problem as JSON, every number in SI.
+        urdf: The robot's URDF.
+    """
+
+    recipe: str
+    urdf: str
+
+    def __repr__(self) -> str:
+        return f"<problem {json.loads(self.recipe).get('name', '')} of a dataset>"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +120,19 @@ class Blueprint:
     def key(self) -> int:
         """The first 60 bits of the fingerprint: HDF5 stores numbers under a checksum, texts not."""
         return int(self.fingerprint[:15], 16)
+
+    @property
+    def problem(self) -> StoredProblem:
+        """The problem whose motions the rows are the ends of.
+
+        Raises:
+            DatasetError: The plan does not say.
+        """
+        try:
+            content, urdf = self.recipe["pipeline"]["problem"], self.robot["urdf"]
+        except KeyError as error:
+            raise DatasetError(f"the plan of {self.name} lacks {error}, and so does not say its problem") from None
+        return StoredProblem(json.dumps(content, ensure_ascii=False), str(urdf))
 
     def field_named(self, name: str) -> Field:
         """Return the field called ``name``.

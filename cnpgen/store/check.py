@@ -109,7 +109,7 @@ def _reason(error: DatasetError, path: Path) -> str:
 def _check_manifest(folder: Path, blueprint: Blueprint) -> tuple[list[Finding], dict[str, Any]]:
     """Check the manifest and the files it lists; return it empty if it cannot be relied upon."""
     if not (folder / MANIFEST).exists():
-        summary = summarise(folder, blueprint, allow_partial=True)
+        summary = summarise(folder, blueprint, allow_incomplete=True)
         return [Finding(MANIFEST, f"is missing: the dataset is {unfinished(summary)}", advice=MAKE_AGAIN)], {}
     try:
         manifest = load_manifest(folder)

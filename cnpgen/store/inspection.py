@@ -158,7 +158,7 @@ def inspect_dataset(folder: str | Path) -> Inspection:
         blueprint = load_blueprint(folder)
     except DatasetError as error:
         raise DatasetError(f"{error}; 'cnpgen validate' says what to do") from error
-    summary = summarise(folder, blueprint, allow_partial=True)
+    summary = summarise(folder, blueprint, allow_incomplete=True)
     sealed = (folder / MANIFEST).is_file()
     damage = tuple(str(finding) for finding in check_documents(folder, blueprint)) if sealed else ()
     return Inspection(folder, summary, sealed, _size(folder, blueprint), damage)

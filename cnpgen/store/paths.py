@@ -1,9 +1,10 @@
 """What users point at: the folder of a dataset, a file. What is not there is a mistake in an argument, not damage."""
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 
-from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.errors import DatasetError, MachineError, UsageError, nearest
 from cnpgen.store.workspace import is_dataset
 
 
@@ -19,6 +20,11 @@ def require_folder(folder: Path) -> None:
     if not folder.is_dir():
         what = "a file" if folder.exists() else "not there"
         raise UsageError(f"{folder} is {what}, expected the folder of a dataset")
+
+
+def no_split(folder: Path, split: object, splits: Collection[str]) -> str:
+    """Say that a dataset has no such split, and which it has."""
+    return f"{folder} has no split {split!r}{nearest(str(split), splits)}: expected one of {', '.join(splits)}"
 
 
 def require_file(path: Path, what: str, *, of_dataset: str = "") -> None:

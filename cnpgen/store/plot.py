@@ -113,7 +113,7 @@ def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:
 
 def _some_rows(inspection: Inspection) -> dict[str, NDArray[Any]]:
     """Read the first rows of the first split that has any."""
-    dataset = open_dataset(inspection.folder, allow_partial=True)
+    dataset = open_dataset(inspection.folder, allow_incomplete=True)
     wanted = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
     fields = [field.name for field in inspection.blueprint.fields if field.name in wanted]
     split = next(split for split, rows in inspection.rows.items() if rows)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, nearest
+from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.paths import require_folder
+from cnpgen.store.paths import no_split, require_folder
 from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard, storage_dtype
 from cnpgen.store.summary import summarise, unfinished
@@ -43,7 +43,7 @@ class StoredDataset:
             DatasetError: There is no such split.
         """
         if split not in self.blueprint.splits:
-            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(split, self.blueprint.splits)}")
+            raise DatasetError(no_split(self.folder, split, self.blueprint.splits))
         found = [task for task in shards(self.blueprint) if task.split == split]
         if self.manifest is None:
             return [task for task in found if is_committed(self.folder, task, self.blueprint.fingerprint)]
@@ -133,12 +133,12 @@ def _of_sidecar(folder: Path, task: ShardTask) -> tuple[int, str]:
     return record.bytes, record.sha256
 
 
-def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDataset:
+def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:
     """Open a dataset for reading.
 
     Args:
         folder: Its folder.
-        allow_partial: Open it even if it is unfinished.
+        allow_incomplete: Open it even if it is unfinished.
 
     Raises:
         UsageError: There is no such folder.
@@ -153,6 +153,6 @@ def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDa
         if manifest["plan_fingerprint"] != blueprint.fingerprint:
             raise DatasetError(f"{folder / MANIFEST} is of another plan than plan.json: the folder mixes two datasets")
         return StoredDataset(folder, blueprint, manifest)
-    if not allow_partial:
-        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_partial=True))}")
+    if not allow_incomplete:
+        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_incomplete=True))}")
     return StoredDataset(folder, blueprint, None)

@@ -59,13 +59,13 @@ class Summary:
         return {split: merge_statistics(items) for split, items in parts.items() if items}
 
 
-def summarise(folder: Path, blueprint: Blueprint, *, allow_partial: bool = False) -> Summary:
+def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = False) -> Summary:
     """Read the sidecars of a dataset.
 
     Args:
         folder: The dataset's folder.
         blueprint: Its plan.
-        allow_partial: Take what is there instead of refusing.
+        allow_incomplete: Take what is there instead of refusing.
 
     Raises:
         DatasetError: A shard is missing, damaged or of another plan; the message says which.
@@ -78,7 +78,7 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_partial: bool = False
         except DatasetError as error:
             problems.append(str(error))
     summary = Summary(blueprint, tuple(records), tuple(problems))
-    if problems and not allow_partial:
+    if problems and not allow_incomplete:
         more = [f"and {len(problems) - _N_SHOWN} more"] if len(problems) > _N_SHOWN else []
         shown = "\n  ".join([*problems[:_N_SHOWN], *more])
         raise DatasetError(f"{folder} is {unfinished(summary)}:\n  {shown}")

@@ -1,6 +1,5 @@
 """The recipe of docs/loading.md for Lightning, interrupted in the middle of an epoch; in the extended run only."""
 
-# ruff: noqa: E402 - without the framework nothing else is imported
 import re
 import warnings
 from pathlib import Path
@@ -67,7 +66,7 @@ def block() -> str:
 def recipe(block: str) -> Any:
     """The DataModule of the documentation."""
     module: dict[str, Any] = {}
-    exec(block.split("\n\n\n# ")[0], module)
+    exec(block.partition("\n\n\n# ")[0], module)
     return module["Rows"]
 
 

@@ -192,6 +192,20 @@ def test_croissant_lists_the_files_and_promises_no_records(dataset: Path) -> Non
         assert item["sha256"] == hashlib.sha256(content).hexdigest()
 
 
+def test_croissant_says_the_unit_of_every_field(dataset: Path) -> None:
+    croissant = json.loads((dataset / "croissant.json").read_text())
+    vocabulary = croissant["@context"]["@vocab"]
+    assert vocabulary == croissant["@context"]["sc"] == "https://schema.org/"
+    variables = croissant["variableMeasured"]
+    assert {item["@type"] for item in variables} == {"sc:PropertyValue"}
+    assert {item["name"]: item["unitText"] for item in variables} == {field.name: field.unit for field in PLAN.fields}
+    start, goal, clearance, number = variables
+    assert start["description"] == "initial joint positions (j1, j2, j3)"
+    assert (start["minValue"], start["maxValue"]) == (-2.0, 2.0)
+    assert (clearance["description"], clearance["minValue"]) == ("smallest distance", 0.0)
+    assert not {"minValue", "maxValue"} & (goal.keys() | number.keys())
+
+
 def test_the_card_says_what_the_fields_are_and_what_was_rejected(dataset: Path) -> None:
     card = (dataset / "README.md").read_text()
     assert card.startswith('---\nlicense: "cc-by-4.0"\npretty_name: "A \\"small\\" dataset: for tests"\n')

@@ -65,7 +65,7 @@ def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run the same"):
         open_dataset(tmp_path)
-    opened = open_dataset(tmp_path, allow_partial=True)
+    opened = open_dataset(tmp_path, allow_incomplete=True)
     assert opened.manifest is None
     assert opened.read("train")["sample_id"].tolist() == list(range(32, 50))
     assert opened.read("validation")["start_q"].shape == (0, 3)
@@ -98,7 +98,7 @@ def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset:
     change_a_number(dataset / second.file)
     if not finished:
         (dataset / "manifest.json").unlink()
-    opened = open_dataset(dataset, allow_partial=not finished)
+    opened = open_dataset(dataset, allow_incomplete=not finished)
     assert len(opened.read("train", stop=32)["start_q"]) == 32  # the other shard is good
     with pytest.raises(DatasetError) as by_rows:
         opened.read("train", start=40)

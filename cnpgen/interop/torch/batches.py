@@ -77,9 +77,9 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
     Its ``state_dict`` says where it is, to the batch. Trainers that look for one (Lightning) save it in their
     checkpoints and resume there.
 
-    A ``DataLoader`` needs ``batch_size=None``. With workers the order is the same, and every loop begins the next epoch,
-    also after one that was left early; workers that live on are told of it by :meth:`set_epoch`, but not of a state
-    that is loaded later. As each worker reads all shards, they cost more than they bring.
+    A ``DataLoader`` needs ``batch_size=None``. With workers the order is the same, and every loop begins the next
+    epoch, also after one that was left early; workers that live on are told of it by :meth:`set_epoch`, but not of a
+    state that is loaded later. As each worker reads all shards, they cost more than they bring.
 
     Args:
         batches: What ``dataset.batches(...)`` returned.
