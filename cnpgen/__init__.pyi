@@ -75,8 +75,8 @@ from cnpgen.robots.spec import Obstacle as Obstacle
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
 from cnpgen.store.blueprint import Blueprint as Blueprint
-from cnpgen.store.blueprint import StoredProblem as StoredProblem
 from cnpgen.store.blueprint import ShardTask as ShardTask
+from cnpgen.store.blueprint import StoredProblem as StoredProblem
 from cnpgen.store.check import Finding as Finding
 from cnpgen.store.inspection import Inspection as Inspection
 from cnpgen.store.inspection import inspect_dataset as inspect_dataset

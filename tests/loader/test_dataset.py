@@ -15,7 +15,8 @@ from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
 from cnpgen.problems.load import load_problem
-from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.problems.problem import problem_identity
+from cnpgen.problems.record import as_problem, as_record, record_problem
 from cnpgen.store.blueprint import save_plan, shards
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
@@ -77,7 +78,8 @@ def test_a_split_that_is_not_there_is_refused_with_those_that_are(dataset: Datas
 
 def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
     found, problem = cnpgen.load_dataset(tiny("airhockey-hit")).problem, load_problem("airhockey")
-    assert ProblemRecord(found.recipe, found.urdf) == record_problem(problem)
+    assert as_record(found) == record_problem(problem)
+    assert problem_identity(as_problem(found)) == problem_identity(problem)
     assert found.urdf == problem.urdf_path.read_text()
     assert repr(found) == "<problem airhockey of a dataset>"
 
