@@ -76,12 +76,12 @@ from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
 from cnpgen.store.blueprint import Blueprint as Blueprint
 from cnpgen.store.blueprint import ShardTask as ShardTask
+from cnpgen.store.blueprint import StoredProblem as StoredProblem
 from cnpgen.store.check import Finding as Finding
 from cnpgen.store.fates import DensityMap as DensityMap
 from cnpgen.store.fates import Fates as Fates
 from cnpgen.store.inspection import Inspection as Inspection
 from cnpgen.store.inspection import inspect_dataset as inspect_dataset
-from cnpgen.store.reader import StoredDataset as StoredDataset
 from cnpgen.store.record import ShardRecord as ShardRecord
 from cnpgen.store.statistics import FieldStatistics as FieldStatistics
 from cnpgen.store.summary import Summary as Summary

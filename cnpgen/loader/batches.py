@@ -1,6 +1,6 @@
 """The batches of a split, epoch by epoch, from any row on."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -33,8 +33,8 @@ class Batches:
 
     Attributes:
         times_set: How often the position was set since, by ``epoch`` or ``load_state``.
-        taken_elsewhere: Of whatever hands batches to other processes: whether those took some since the position was
-            last set, which is not seen here. ``state()`` asks.
+        notes: What workers in other processes noted when they last took batches, in memory that they share, shape
+            (workers, 2): the epoch that comes next, and ``times_set``; None where there are no workers.
 
     Raises:
         UsageError: There are fewer rows than one batch needs, or in the last batch than there are ranks.
@@ -50,10 +50,10 @@ class Batches:
         self._source, self._form, self._cut, self._position = source, form, cut, position
         self._kept: Kept | None = None
         self.times_set = 0
-        self.taken_elsewhere: list[Callable[[], bool]] = []
+        self.notes: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_kept": None, "taken_elsewhere": []}
+        return self.__dict__ | {"_kept": None, "notes": None}
 
     def __repr__(self) -> str:
         source, position = self._source, self._position
@@ -138,7 +138,7 @@ class Batches:
             row = min(used * self._cut.batch_size, self._source.rows)
             epoch = position.epoch if epoch is None else integer("epoch", epoch, least=0)
             position = self._forward(replace(position, epoch=epoch, row=row))
-        elif any(taken() for taken in self.taken_elsewhere):
+        elif self.notes is not None and (self.notes[:, 1] == self.times_set).any():
             raise UsageError(
                 "the workers of a DataLoader took these batches, so that it is not known here how many were used: say"
                 " it with state(epoch=..., batch=...), or leave num_workers at 0"

@@ -19,10 +19,11 @@ from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_problem
+from cnpgen.problems.record import as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import flag, number, real_array
+from cnpgen.store.blueprint import StoredProblem
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
@@ -56,8 +57,8 @@ class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
 
     Args:
-        problem: The problem, its record (``plans.problem``), or the name or the file of a problem, a pipeline or a
-            dataset.
+        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
+            a pipeline or a dataset.
         dtype: "float32" or "float64": what is computed with.
         nodes: Number of quadrature nodes.
         rule: Quadrature rule: "cosine" or "gauss".
@@ -78,7 +79,7 @@ class PlanLoss:
 
     def __init__(
         self,
-        problem: Problem | ProblemRecord | str | Path,
+        problem: Problem | StoredProblem | str | Path,
         *,
         dtype: Dtype = "float32",
         nodes: int = 64,

@@ -3,7 +3,6 @@
 Rows of a certified dataset have their plans already.
 """
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,14 +14,12 @@ from cnpgen.kernels.library import choose_backend
 from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.problems.record import ProblemRecord, as_record, record_problem
 from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from cnpgen.store.blueprint import Blueprint
 
 Array = NDArray[np.float64]
 SPLIT = "(fresh draws)"  # no split can be called so: no row of any dataset is among them
@@ -79,7 +76,9 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
         wanted = f"{stop - start} from row {start} on"
         raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}")
     source = f"dataset {dataset.blueprint.name}, seed {dataset.blueprint.seed}, split {split}"
-    return problems_of_rows(record_of(dataset.blueprint), dataset.read(split, start=start, stop=stop), source=source)
+    return problems_of_rows(
+        as_record(dataset.blueprint.problem), dataset.read(split, start=start, stop=stop), source=source
+    )
 
 
 def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
@@ -114,10 +113,3 @@ def draw_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | Non
         columns[field.name] = np.ascontiguousarray(values if field.width else values[:, 0])
     source = f"fresh draws of {loaded.name}, seed {root}"
     return problems_of_rows(record_problem(loaded.pipeline.problem), columns, source=source)
-
-
-def record_of(blueprint: "Blueprint") -> ProblemRecord:
-    """Return the problem that a dataset was made for."""
-    return ProblemRecord(
-        json.dumps(blueprint.recipe["pipeline"]["problem"], ensure_ascii=False), blueprint.robot["urdf"]
-    )

@@ -24,9 +24,10 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_problem
+from cnpgen.problems.record import as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema.arguments import integer, number, real_array
+from cnpgen.store.blueprint import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -40,8 +41,8 @@ class Omega:
     has equalities, line and path are bent onto them, in zero steps in the paper.
 
     Args:
-        problem: The problem, its record (``plans.problem``), or the name or the file of a problem, a pipeline or a
-            dataset.
+        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
+            a pipeline or a dataset.
         path_scale: What phi is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps that bend the path.
@@ -60,7 +61,7 @@ class Omega:
 
     def __init__(
         self,
-        problem: Problem | ProblemRecord | str | Path,
+        problem: Problem | StoredProblem | str | Path,
         *,
         path_scale: float = 0.5,
         bending_steps: int = 1,

@@ -1,6 +1,5 @@
 """What is to be planned: rows of a dataset, checked against what a model can do."""
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from cnpgen.errors import DatasetError, UsageError, lacks
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
 from cnpgen.plans.format import BOUNDARY
-from cnpgen.problems.record import ProblemRecord
+from cnpgen.problems.record import ProblemRecord, as_record
 from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
@@ -75,13 +74,6 @@ def read_rows(
     return Requests(boundary, found.get("sample_id", np.arange(first, stop)), columns)
 
 
-def record_of(blueprint: Blueprint) -> ProblemRecord:
-    """Return the problem of a dataset."""
-    return ProblemRecord(
-        json.dumps(blueprint.recipe["pipeline"]["problem"], ensure_ascii=False), str(blueprint.robot["urdf"])
-    )
-
-
 def boundary_in(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
     """Take the boundary conditions out of named columns; what is missing is zero.
 
@@ -113,7 +105,7 @@ def _drawing(stages: Iterable[Mapping[str, Any]]) -> str:
 
 def check_drawing(where: str, blueprint: Blueprint, model: Model, *, other: bool) -> None:
     """Refuse rows of another problem, and if not ``other`` those drawn in another way than the training rows."""
-    check_problem(where, record_of(blueprint), model)
+    check_problem(where, as_record(blueprint.problem), model)
     trained = model.training.get("stages")
     if other or trained is None or _drawing(trained) == _drawing(blueprint.recipe["pipeline"]["stage"]):
         return

@@ -16,6 +16,7 @@ from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, as_record, record_problem
+from cnpgen.store.blueprint import StoredProblem
 from cnpgen.store.files.hdf5 import opened_foreign_hdf5
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary
@@ -23,7 +24,7 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 
-def load_plans(path: str | Path, *, problem: Problem | ProblemRecord | str | Path | None = None) -> Plans:
+def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:
     """Read plans from a file that cnpgen or anybody else has written.
 
     Names, shapes and types must be right. Values need not be: every plan is judged for itself, later.

@@ -17,6 +17,7 @@ from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.arguments import integer, numbers
+from cnpgen.store.blueprint import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 
@@ -107,7 +108,7 @@ class PlanIndexError(UsageError, IndexError):
 
 
 def make_plans(
-    problem: Problem | ProblemRecord | str | Path,
+    problem: Problem | StoredProblem | str | Path,
     boundary: Boundary,
     *,
     path_control_points: ArrayLike,

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_problem
+from cnpgen.problems.record import as_problem
+from cnpgen.store.blueprint import StoredProblem
 
 Array = NDArray[np.float64]
 
 
-def obstacle_tops(problem: Problem | ProblemRecord | str | Path, start_xyz: Array, goal_xyz: Array) -> Array:
+def obstacle_tops(problem: Problem | StoredProblem | str | Path, start_xyz: Array, goal_xyz: Array) -> Array:
     """Compute the heights of the obstacles' upper faces [m], shape (..., n_obstacles).
 
     An obstacle with ``below`` ends at the bottom of the object (at the tip, if there is none) at that end.

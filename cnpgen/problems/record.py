@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.problems.load import load_problem_behind, restore_problem
 from cnpgen.problems.problem import Problem, resolved
+from cnpgen.store.blueprint import StoredProblem
 from cnpgen.store.files.documents import canonical_sha256, differences, plain
 from cnpgen.trajectory.spec import TrajectorySpec
 
@@ -29,17 +30,9 @@ _MOVING = ("revolute", "continuous", "prismatic")
 _JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
 
 
-@dataclass(frozen=True)
-class ProblemRecord:
-    """A problem as text.
-
-    Attributes:
-        recipe: The resolved problem as JSON, every number in SI.
-        urdf: The robot's URDF.
-    """
-
-    recipe: str
-    urdf: str
+@dataclass(frozen=True, repr=False)
+class ProblemRecord(StoredProblem):
+    """A problem as text, and what it means."""
 
     def __repr__(self) -> str:
         return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
@@ -141,8 +134,8 @@ def as_problem(problem: object) -> Problem:
     """
     if isinstance(problem, Problem):
         return problem
-    if isinstance(problem, ProblemRecord):
-        return _rebuilt(problem)
+    if isinstance(problem, StoredProblem):
+        return _rebuilt(as_record(problem))
     if isinstance(problem, str | Path):
         return load_problem_behind(problem)
     expected = "a Problem, a ProblemRecord, or the name or the file of a problem, a pipeline or a dataset"
@@ -156,7 +149,11 @@ def as_record(problem: object) -> ProblemRecord:
         UsageError: It is nothing of the kind.
         RecipeError: There is no such recipe, or with every mistake in the problem's file.
     """
-    return problem if isinstance(problem, ProblemRecord) else record_problem(as_problem(problem))
+    if isinstance(problem, ProblemRecord):
+        return problem
+    if isinstance(problem, StoredProblem):
+        return ProblemRecord(problem.recipe, problem.urdf)
+    return record_problem(as_problem(problem))
 
 
 @lru_cache(maxsize=8)

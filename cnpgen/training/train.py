@@ -10,7 +10,7 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
-from cnpgen.planner.requests import record_of
+from cnpgen.problems.record import as_record
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.training.checkpoint import Checkpoints
@@ -92,7 +92,7 @@ def train_model(
         if job.out.exists() and not job.checkpoints.path.exists():
             return _finished(job)
         check_beside(job.out)
-    with one_thread(), surroundings(record_of(job.source.dataset.blueprint)) as given:
+    with one_thread(), surroundings(as_record(job.source.dataset.problem)) as given:
         run, kit = prepare_run(job.source, given, job.settings, check_rows=job.check_rows, command=command)
         state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
         if begin is not None:

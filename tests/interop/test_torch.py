@@ -209,6 +209,16 @@ def test_a_position_that_only_workers_know_is_refused_until_it_is_set_again(data
     assert batches.state() == batches.state(epoch=4)
 
 
+def test_all_data_sets_of_the_same_batches_know_what_workers_took(dataset: Dataset) -> None:
+    batches = dataset.batches(10, fields=ALL)
+    for epoch in range(3):
+        assert rows(DataLoader(BatchDataset(batches), batch_size=None, num_workers=1)) == ids(
+            dataset.batches(10, fields=ALL, epoch=epoch)
+        )
+        with pytest.raises(UsageError, match="workers"):
+            batches.state()
+
+
 class AskedInWorker(BatchDataset):
     """Asks for the position where it cannot be known."""
 

@@ -15,7 +15,7 @@ from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
 from cnpgen.problems.load import load_problem
-from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.problems.record import as_problem, as_record, record_problem
 from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
@@ -77,7 +77,8 @@ def test_a_split_that_is_not_there_is_refused_with_those_that_are(dataset: Datas
 
 def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
     found, problem = cnpgen.load_dataset(tiny("airhockey-hit")).problem, load_problem("airhockey")
-    assert ProblemRecord(found.recipe, found.urdf) == record_problem(problem)
+    assert as_record(found) == record_problem(problem)
+    assert as_problem(found).identity == problem.identity
     assert found.urdf == problem.urdf_path.read_text()
     assert repr(found) == "<problem airhockey of a dataset>"
 

@@ -90,8 +90,9 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         self.batches = batches
         # Workers have copies of the position, which may end with them. So each notes in shared memory which epoch it
         # has to give next, and how often the position had been set when it did: a position set later counts instead.
-        self._next = torch.full((MOST_WORKERS, 2), -1).share_memory_()
-        batches.taken_elsewhere.append(self._taken_by_workers)
+        if batches.notes is None:
+            batches.notes = torch.full((MOST_WORKERS, 2), -1).share_memory_()
+        self._notes = batches.notes  # a worker's copy of the batches may come without
 
     def __len__(self) -> int:
         return len(self.batches)
@@ -100,7 +101,7 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         worker = data.get_worker_info()
         if worker is None:
             return map(to_torch, self.batches)
-        mine, batches = self._next[worker.id], self.batches
+        mine, batches = self._notes[worker.id], self.batches
         epoch, times_set = mine.tolist()
         if epoch in {-1, batches.epoch} or times_set not in {-1, batches.times_set}:
             epoch = None
@@ -112,7 +113,7 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         """Begin an epoch, here and in all workers; where it is the present one, go on in it."""
         if self.batches.epoch != epoch:
             self.batches.epoch = epoch
-        self._next.copy_(torch.tensor([epoch, -1]))
+        self._notes.copy_(torch.tensor([epoch, -1]))
 
     def state_dict(self) -> dict[str, Any]:
         """Say where it is: after the last batch handed out, as ``Batches.state`` does.
@@ -132,7 +133,3 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
             DatasetError: It is of another dataset or split.
         """
         self.batches.load_state(state)
-
-    def _taken_by_workers(self) -> bool:
-        """Say whether workers took batches since the position was last set."""
-        return bool((self._next[:, 1] == self.batches.times_set).any())
