@@ -50,7 +50,8 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
             f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
         )
     if text not in known:
-        hint = nearest(text, known)
+        others = " and ".join(f"a {kind}" for kind in _LAYOUT if kind not in kinds and text in list_recipes(kind))
+        hint = f": it is the name of {others}" if others else nearest(text, known)
         raise ValueError(f"unknown {kinds[0]} {text!r}{hint}; known: {', '.join(known) or 'none'}")
     return known[text]
 

@@ -373,6 +373,25 @@ def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path
         load_pipeline(text)
 
 
+@pytest.mark.parametrize(
+    ("load", "name", "message"),
+    [
+        (
+            load_problem,
+            "airhockey-hit",
+            "unknown problem 'airhockey-hit': it is the name of a pipeline and a dataset; ",
+        ),
+        (load_pipeline, "airhockey", "unknown pipeline 'airhockey': it is the name of a problem; known: "),
+        (load_dataset_recipe, "airhockey", "unknown dataset 'airhockey': it is the name of a problem; known: "),
+    ],
+)
+def test_a_name_of_another_kind_is_said_to_be_one(load, name, message):
+    with pytest.raises(RecipeError) as caught:
+        load(name)
+    (mistake,) = caught.value.mistakes
+    assert mistake.startswith(message)
+
+
 def test_a_file_without_suffix_is_a_path(shipped, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipelines" / "roll.toml").rename(tmp_path / "pipelines" / "mine")

@@ -54,8 +54,10 @@ def test_rows_that_do_not_exist_are_refused(dataset: Path, start: int, stop: int
 
 def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
     opened = open_dataset(dataset)
-    with pytest.raises(DatasetError, match="did you mean 'validation'"):
-        opened.read("valid")
+    for split in ("val", "valid"):
+        message = rf"has no split '{split}' \(did you mean 'validation'\?\), only train, validation$"
+        with pytest.raises(DatasetError, match=message):
+            opened.read(split)
     with pytest.raises(DatasetError, match="did you mean 'start_q'"):
         opened.read("train", fields=["start_dq"])
 
