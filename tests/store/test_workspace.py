@@ -9,10 +9,10 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.blueprint import load_blueprint, shards, write_blueprint
 from cnpgen.store.workspace import (
     Workspace,
+    begun_blueprint,
     check_clearable,
     check_place,
     find_workspace,
-    is_begun,
     open_workspace,
     require_blueprint,
 )
@@ -43,7 +43,7 @@ def test_a_dataset_whose_blueprint_is_damaged_is_a_dataset_still(tmp_path: Path)
     assert (found.holds, found.rows, found.blueprint) == ("a dataset", True, None)
     assert "plan.json is damaged" in found.damage
     with pytest.raises(DatasetError, match=r"damaged.*--force replaces"):
-        is_begun(found, BLUEPRINT)
+        begun_blueprint(found, BLUEPRINT)
     assert check_clearable(found) == [tmp_path / "train"]
 
 
