@@ -4,6 +4,7 @@ import ast
 import importlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -18,12 +19,29 @@ import cnpgen
 ROOT = Path(__file__).parents[1]
 
 
+STRAY = (  # files that were left lying about
+    "datasets/models/experiment.h5",
+    "datasets/models/airhockey-hit.h5.checkpoint",
+    "datasets/rows.csv",
+    "pipelines/airhockey-hit.toml.orig",
+    "problems/airhockey/mesh.stl",
+    "cnpgen/notes.txt",
+)
+
+
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """The wheel of a copy of the repository in which files were left lying about."""
     pytest.importorskip("build")
     pytest.importorskip("hatchling")
-    out = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)]
+    copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("wheel")
+    for name in ("cnpgen", "problems", "pipelines", "datasets"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    for name in STRAY:
+        (copy / name).write_text("left lying about")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(copy)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return zipfile.ZipFile(next(out.glob("*.whl")))
@@ -40,6 +58,16 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
             if path.is_file():
                 assert f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" in wheel.namelist()
     assert "cnpgen/py.typed" in wheel.namelist()
+
+
+def test_the_wheel_carries_nothing_that_was_left_lying_about(wheel: zipfile.ZipFile) -> None:
+    shipped = {name.removeprefix("cnpgen/_recipes/") for name in wheel.namelist()}
+    assert not shipped.intersection(STRAY)
+    tracked = (
+        path for folder in ("cnpgen", "problems", "pipelines", "datasets") for path in (ROOT / folder).rglob("*")
+    )
+    expected = {path.relative_to(ROOT).as_posix() for path in tracked if path.is_file() and path.suffix != ".pyc"}
+    assert {name for name in shipped if ".dist-info/" not in name} <= expected
 
 
 INSTALLED = """

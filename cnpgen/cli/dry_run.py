@@ -11,7 +11,7 @@ from cnpgen.store.blueprint import Blueprint, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.record import pending
 from cnpgen.store.shard import storage_dtype
-from cnpgen.store.workspace import Workspace, check_clearable, find_workspace, is_begun
+from cnpgen.store.workspace import Workspace, begun_blueprint, check_clearable, find_workspace
 
 if TYPE_CHECKING:
     from cnpgen.make.recipe import DatasetRecipe
@@ -94,12 +94,12 @@ def _replacement(workspace: Workspace) -> str:
 def _refusal(workspace: Workspace, blueprint: Blueprint) -> str:
     """Say what becomes of a dataset that is not the one that would be made; nothing if it is."""
     try:
-        begun = is_begun(workspace, blueprint)
+        begun = begun_blueprint(workspace, blueprint)
     except UsageError:
         return "holds another dataset: would be refused without --force"
     except DatasetError:
         return "holds a dataset with a damaged plan.json: would be refused without --force"
-    return "" if begun else "holds a plan.json of which nothing was made: would be replaced"
+    return "" if begun is not None else "holds a plan.json of which nothing was made: would be replaced"
 
 
 def _progress(folder: Path, blueprint: Blueprint) -> str:

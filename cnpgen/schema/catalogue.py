@@ -49,7 +49,8 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
             f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
         )
     if text not in known:
-        raise ValueError(f"unknown {_either(kinds)} {text!r}{_hint(text, known)}; known: {', '.join(known) or 'none'}")
+        hint = _hint(text, kinds, known)
+        raise ValueError(f"unknown {_either(kinds)} {text!r}{hint}; known: {', '.join(known) or 'none'}")
     return known[text]
 
 
@@ -58,10 +59,10 @@ def _either(kinds: tuple[Kind, ...]) -> str:
     return " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
 
 
-def _hint(text: str, known: Iterable[str]) -> str:
-    """Say of what other kind there is a recipe of this name, or which known name is near."""
-    other = next((kind for kind in reversed(_LAYOUT) if text in list_recipes(kind)), None)
-    return f", which is a {other}" if other else nearest(text, known)
+def _hint(text: str, kinds: tuple[Kind, ...], known: Iterable[str]) -> str:
+    """Say of which other kinds there is a recipe of this name, or which known name is near."""
+    others = " and ".join(f"a {kind}" for kind in _LAYOUT if kind not in kinds and text in list_recipes(kind))
+    return f": it is the name of {others}" if others else nearest(text, known)
 
 
 def load_recipe(

@@ -81,21 +81,23 @@ def check_place(workspace: Workspace) -> None:
         raise machine_error("write to", workspace.folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
 
 
-def is_begun(workspace: Workspace, blueprint: Blueprint) -> bool:
-    """Whether a folder has the blueprint already; if not, it may be written.
+def begun_blueprint(workspace: Workspace, wanted: Blueprint) -> Blueprint | None:
+    """Return the blueprint in a folder if it is the one that is wanted; if there is none, it may be written.
+
+    It is the same, but perhaps written by another version of cnpgen, as its shards say.
 
     Raises:
         UsageError: It has rows of another blueprint.
         DatasetError: It has rows, and its blueprint is damaged.
     """
     found = workspace.blueprint
-    if found is not None and found.fingerprint == blueprint.fingerprint:
-        return True
-    if workspace.rows and found is None:
+    if found is not None and found.fingerprint == wanted.fingerprint:
+        return found
+    if not workspace.rows:
+        return None
+    if found is None:
         raise DatasetError(f"{workspace.damage}; --force replaces the whole dataset")
-    if workspace.rows and found is not None:
-        raise UsageError(f"{workspace.folder} {_refusal(found, blueprint)}")
-    return False
+    raise UsageError(f"{workspace.folder} {_refusal(found, wanted)}")
 
 
 def open_workspace(folder: Path, blueprint: Blueprint, *, force: bool = False) -> Blueprint:
@@ -110,7 +112,7 @@ def open_workspace(folder: Path, blueprint: Blueprint, *, force: bool = False) -
         force: Whether to delete the dataset that is in the folder.
 
     Returns:
-        The blueprint in the folder: the same, but perhaps written by another version of cnpgen, as its shards say.
+        The blueprint in the folder (see ``begun_blueprint``).
 
     Raises:
         UsageError: The folder holds something else.
@@ -120,17 +122,17 @@ def open_workspace(folder: Path, blueprint: Blueprint, *, force: bool = False) -
     workspace = find_workspace(folder)
     check_place(workspace)
     workspace = _cleared(workspace) if force else workspace
-    begun = is_begun(workspace, blueprint)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in () if begun else _SUMMARIES:
-            (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise machine_error("write to", folder, error) from error
-    if not begun:
+    begun = begun_blueprint(workspace, blueprint)
+    if begun is None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name in _SUMMARIES:
+                (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise machine_error("write to", folder, error) from error
         write_blueprint(folder, blueprint)
     sweep(folder / WORK)
-    return workspace.blueprint if begun and workspace.blueprint else blueprint
+    return begun or blueprint
 
 
 def require_blueprint(folder: Path, blueprint: Blueprint) -> None:

@@ -233,8 +233,8 @@ def test_cut_off_and_foreign_files_are_one_line(run: Run, saved: Callable[[Plans
     content = file.read_bytes()
     for name, changed, message in (
         ("cut.h5", content[: len(content) // 2], "cut.h5 is damaged or cut off"),
-        ("text.h5", b"hello", "text.h5 is damaged or cut off"),
-        ("empty.h5", b"", "empty.h5 is damaged or cut off"),
+        ("text.h5", b"hello", "text.h5 is not an HDF5 file, or its beginning is damaged: it seems to be a text file"),
+        ("empty.h5", b"", "empty.h5 is not an HDF5 file, or its beginning is damaged: it is empty"),
     ):
         other = file.with_name(name)
         other.write_bytes(changed)

@@ -393,7 +393,7 @@ def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(mon
     assert "300 tried, 66.7% accepted" in terminal.getvalue()
     assert "row/s" in terminal.getvalue()
     assert meter.rows == 200
-    assert meter.outcome.tried == 300
+    assert meter.fates.tried == 300
 
 
 def test_a_file_sees_a_single_line(capsys):

@@ -172,3 +172,18 @@ def hit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("plans") / "hit.h5"
     save_plans(path, plans_of(load("hit")))
     return path
+
+
+SPLITS = {
+    "solve": ("solve", "{}", "--split", "val", "-o", "out.h5"),
+    "plan": ("plan", "{}", "--model", "airhockey-hit", "--split", "val", "-o", "out.h5"),
+}
+
+
+@pytest.mark.parametrize("words", SPLITS.values(), ids=SPLITS)
+def test_a_split_that_is_not_there_is_answered_with_those_that_are(
+    said: Said, words: tuple[str, ...], tiny: Callable[[str], Path]
+) -> None:
+    folder = tiny("airhockey-hit")
+    text = "has no split 'val' (did you mean 'validation'?), only train, validation"
+    assert said(words, str(folder)) == (2, f"{folder} {text}")

@@ -11,26 +11,26 @@ from numpy.typing import NDArray
 from cnpgen.loader.batch import Batch
 from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.manifest import finalize
-from tests.examples.store import PLAN, make_columns, make_shard
+from tests.examples.store import BLUEPRINT, make_columns, make_shard
 
 ALL = ("start_q", "goal_p", "clearance", "sample_id")
 
 
 def make(folder: Path, *, finished: bool = True, **changes: Any) -> Path:
     """Make the store's example with other splits, shards, seed or dtype."""
-    plan = replace(PLAN, **changes)
-    write_blueprint(folder, plan)
-    for task in shards(plan):
-        make_shard(folder, plan, task)
+    blueprint = replace(BLUEPRINT, **changes)
+    write_blueprint(folder, blueprint)
+    for task in shards(blueprint):
+        make_shard(folder, blueprint, task)
     if finished:
-        finalize(folder, plan)
+        finalize(folder, blueprint)
     return folder
 
 
 def columns(split: str = "train", **changes: Any) -> dict[str, NDArray[Any]]:
     """All rows of a split of :func:`make`, from where they were drawn and not from any file."""
-    plan = replace(PLAN, **changes)
-    parts = [make_columns(task, plan.dtype) for task in shards(plan) if task.split == split]
+    blueprint = replace(BLUEPRINT, **changes)
+    parts = [make_columns(task, blueprint.dtype) for task in shards(blueprint) if task.split == split]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -23,7 +23,7 @@ FIELDS = (
     Field("clearance", "m", "smallest distance", role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),
     Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
 )
-PLAN = Blueprint(
+BLUEPRINT = Blueprint(
     name="two-shards",
     version="1.0.0",
     title='A "small" dataset: for tests',
@@ -64,24 +64,24 @@ def make_fates(task: ShardTask) -> Fates:
     )
 
 
-def make_shard(folder: Path, plan: Blueprint, task: ShardTask) -> ShardRecord:
-    columns, fates = make_columns(task, plan.dtype), make_fates(task)
+def make_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> ShardRecord:
+    columns, fates = make_columns(task, blueprint.dtype), make_fates(task)
     return commit_shard(
         folder,
-        plan,
+        blueprint,
         task,
         columns=columns,
         fates=fates,
         started=f"2026-11-21T02:02:0{2 + task.index}+01:00",
         seconds=0.5,
-        versions=dict(plan.versions),
+        versions=dict(blueprint.versions),
     )
 
 
-def make_shards(folder: Path, plan: Blueprint = PLAN) -> None:
-    write_blueprint(folder, plan)
-    for task in shards(plan):
-        make_shard(folder, plan, task)
+def make_shards(folder: Path, blueprint: Blueprint = BLUEPRINT) -> None:
+    write_blueprint(folder, blueprint)
+    for task in shards(blueprint):
+        make_shard(folder, blueprint, task)
 
 
 @pytest.fixture
@@ -89,12 +89,12 @@ def dataset(tmp_path: Path) -> Path:
     """A finished dataset."""
     folder = tmp_path / "two-shards-v1"
     make_shards(folder)
-    finalize(folder, PLAN, notes="Some notes.")
+    finalize(folder, BLUEPRINT, notes="Some notes.")
     return folder
 
 
 def test_every_dataset_of_a_shard_is_at_the_root_and_has_the_same_leading_dimension(dataset: Path) -> None:
-    for task in shards(PLAN):
+    for task in shards(BLUEPRINT):
         with h5py.File(dataset / task.file) as file:
             assert sorted(file) == sorted(field.name for field in FIELDS)
             for item in file.values():
@@ -104,7 +104,7 @@ def test_every_dataset_of_a_shard_is_at_the_root_and_has_the_same_leading_dimens
 
 
 def test_values_are_contiguous_and_aligned_so_that_they_can_be_mapped_into_memory(dataset: Path) -> None:
-    task = shards(PLAN)[0]
+    task = shards(BLUEPRINT)[0]
     expected = make_columns(task)
     with h5py.File(dataset / task.file) as file:
         found = {name: (item.id.get_offset(), item.dtype, item.shape) for name, item in file.items()}
@@ -117,15 +117,15 @@ def test_values_are_contiguous_and_aligned_so_that_they_can_be_mapped_into_memor
 
 def test_a_finished_dataset_has_the_documented_files_and_no_others(dataset: Path) -> None:
     found = sorted(path.relative_to(dataset).as_posix() for path in dataset.rglob("*") if path.is_file())
-    made = [name for task in shards(PLAN) for name in (task.file, task.sidecar)]
+    made = [name for task in shards(BLUEPRINT) for name in (task.file, task.sidecar)]
     assert found == sorted([*made, "README.md", "croissant.json", "manifest.json", "plan.json", "stats.json"])
     assert not (dataset / "_work").exists()
 
 
 def test_no_file_depends_on_where_the_dataset_is_or_when_it_was_finished(tmp_path: Path, dataset: Path) -> None:
     again = tmp_path / "elsewhere" / dataset.name
-    make_shards(again, replace(PLAN))
-    finalize(again, PLAN, notes="Some notes.")
+    make_shards(again, replace(BLUEPRINT))
+    finalize(again, BLUEPRINT, notes="Some notes.")
     for path in dataset.rglob("*"):
         if path.is_file():
             assert (again / path.relative_to(dataset)).read_bytes() == path.read_bytes(), path

@@ -20,7 +20,7 @@ from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
 from tests.examples.loader import ALL, columns, ids, make
-from tests.examples.store import PLAN, make_shard
+from tests.examples.store import BLUEPRINT, make_shard
 
 
 @pytest.fixture(scope="module")
@@ -202,8 +202,8 @@ def test_the_real_thing_is_loaded(tiny) -> None:
 
 
 def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, PLAN)
-    make_shard(tmp_path, PLAN, shards(PLAN)[1])
+    write_blueprint(tmp_path, BLUEPRINT)
+    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards"):
         load_dataset(tmp_path)
     dataset = load_dataset(tmp_path, allow_incomplete=True)
@@ -294,7 +294,7 @@ def test_a_damaged_document_is_refused(copy: Path, name: str) -> None:
         load_dataset(copy)
 
 
-def test_statistics_of_another_plan_are_refused(copy: Path, tmp_path: Path) -> None:
+def test_statistics_of_another_blueprint_are_refused(copy: Path, tmp_path: Path) -> None:
     other = make(tmp_path / "other", seed=3)
     shutil.copy(other / "stats.json", copy / "stats.json")
     with pytest.raises(DatasetError, match=r"stats\.json is of another plan"):
@@ -305,4 +305,4 @@ def test_another_dataset_has_another_fingerprint(dataset: Dataset, tmp_path: Pat
     again = load_dataset(make(tmp_path / "again"))
     other = load_dataset(make(tmp_path / "other", seed=3))
     assert dataset.fingerprint == again.fingerprint != other.fingerprint
-    assert replace(PLAN, seed=3).fingerprint == other.blueprint.fingerprint
+    assert replace(BLUEPRINT, seed=3).fingerprint == other.blueprint.fingerprint

@@ -159,8 +159,8 @@ def test_whoever_watches_is_told_of_the_comparison_and_then_of_the_making(folder
 
 
 def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_rest(folder, monkeypatch):
-    plan = load_blueprint(folder)
-    tasks = shards(plan) * 200
+    blueprint = load_blueprint(folder)
+    tasks = shards(blueprint) * 200
     compared = []
     check = mending.check_committed
     monkeypatch.setattr(mending, "check_committed", lambda *x: (compared.append(x), check(*x))[1])
@@ -169,7 +169,7 @@ def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        mending.find_damaged(folder, plan, tasks, progress=interrupt)
+        mending.find_damaged(folder, blueprint, tasks, progress=interrupt)
     assert 1 <= len(compared) < len(tasks)
 
 

@@ -219,11 +219,11 @@ def test_making_a_shard_twice_is_harmless(job):
 def test_shards_are_the_rows_of_their_blocks_made_together_or_with_gaps(job):
     backend, cache = choose_backend()
     prepared = PreparedPipeline(job.pipeline, backend=backend, cache_folder=cache)
-    plan = replace(job.blueprint, splits={"train": 3 * BLOCK_ROWS}, shard_size=1900)
-    blocks = [prepared.block(plan.seed, "train", index) for index in range(3)]
-    tasks = [task for task in shards(plan) if task.index != 3]
+    blueprint = replace(job.blueprint, splits={"train": 3 * BLOCK_ROWS}, shard_size=1900)
+    blocks = [prepared.block(blueprint.seed, "train", index) for index in range(3)]
+    tasks = [task for task in shards(blueprint) if task.index != 3]
     assert {task.first_row // BLOCK_ROWS for task in tasks} == {0, 1, 2}
-    for task, (columns, fates) in zip(tasks, shard_columns(prepared, plan, tasks), strict=True):
+    for task, (columns, fates) in zip(tasks, shard_columns(prepared, blueprint, tasks), strict=True):
         rows = slice(task.first_row, task.first_row + task.rows)
         for name, values in columns.items():
             expected = np.concatenate([block.columns[name] for block in blocks], axis=1)[:, rows].T
@@ -265,20 +265,20 @@ def test_small_shards_have_the_rows_and_counts_of_large_ones(large, tmp_path):
 
 
 def test_a_second_process_is_started_for_many_rows_or_slow_ones_only(job):
-    plan = replace(job.blueprint, backend="compiled", splits={"train": 200_000})
-    assert is_quick(plan, shards(plan))
-    assert not is_quick(replace(plan, backend="numpy"), shards(plan))
-    assert not is_quick(replace(plan, block_rows=64), shards(plan)[:1])
-    more = replace(plan, splits={"train": 200_001})
+    blueprint = replace(job.blueprint, backend="compiled", splits={"train": 200_000})
+    assert is_quick(blueprint, shards(blueprint))
+    assert not is_quick(replace(blueprint, backend="numpy"), shards(blueprint))
+    assert not is_quick(replace(blueprint, block_rows=64), shards(blueprint)[:1])
+    more = replace(blueprint, splits={"train": 200_001})
     assert not is_quick(more, shards(more))
 
 
 @pytest.mark.parametrize("size", [64, 1000, 4096, 5000, 8192, 100_000])
 @pytest.mark.parametrize("workers", [1, 2, 16])
 def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size, workers):
-    plan = replace(job.blueprint, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
-    tasks = shards(plan)
-    groups = runs(plan, tasks, workers)
+    blueprint = replace(job.blueprint, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
+    tasks = shards(blueprint)
+    groups = runs(blueprint, tasks, workers)
     assert [task for group in groups for task in group] == tasks
     for group in groups:
         assert len({task.split for task in group}) == 1
@@ -290,12 +290,12 @@ def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size,
         assert len(groups) >= min(4 * workers * (workers > 1), 20)
 
 
-def test_the_plan_says_what_the_rows_came_from(tiny):
-    plan = load_blueprint(tiny("airhockey-replan"))
+def test_the_blueprint_says_what_the_rows_came_from(tiny):
+    blueprint = load_blueprint(tiny("airhockey-replan"))
     assert (tiny("airhockey-replan") / PLAN).is_file()
-    assert plan.recipe["pipeline"]["name"] == "airhockey-replan"
-    assert plan.robot["joint_names"] == [f"joint_{k}" for k in range(1, 7)]
-    assert plan.robot["urdf"].startswith("<?xml") or "<robot" in plan.robot["urdf"]
-    assert plan.versions["numpy"] == np.__version__
-    assert plan.seed == load_dataset_recipe("airhockey-replan").seed
-    assert replace(plan, title="another title").fingerprint == plan.fingerprint
+    assert blueprint.recipe["pipeline"]["name"] == "airhockey-replan"
+    assert blueprint.robot["joint_names"] == [f"joint_{k}" for k in range(1, 7)]
+    assert blueprint.robot["urdf"].startswith("<?xml") or "<robot" in blueprint.robot["urdf"]
+    assert blueprint.versions["numpy"] == np.__version__
+    assert blueprint.seed == load_dataset_recipe("airhockey-replan").seed
+    assert replace(blueprint, title="another title").fingerprint == blueprint.fingerprint

@@ -86,7 +86,7 @@ def test_force_replaces_another_dataset(folder):
     assert sorted(digests(folder)) == ["train/shard-00000.h5", "train/shard-00001.h5", "validation/shard-00000.h5"]
 
 
-# --- plans of which nothing was made ----------------------------------------------------------------------------------
+# --- blueprints of which nothing was made -----------------------------------------------------------------------------
 
 
 def hopeless(monkeypatch) -> None:
@@ -114,7 +114,7 @@ def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_correct
 
 
 @pytest.mark.parametrize("content", ["cut", "flipped"])
-def test_a_damaged_plan_of_which_nothing_was_made_gives_way(tmp_path, content):
+def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, content):
     folder = tmp_path / "out"
     make_tiny(folder, part=(0, 9))
     assert not digests(folder)
@@ -128,7 +128,7 @@ def test_a_damaged_plan_of_which_nothing_was_made_gives_way(tmp_path, content):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"garbage", None])
-def test_a_damaged_plan_with_rows_is_refused_until_it_is_forced(folder, content):
+def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, content):
     if content is None:
         flip(folder / "plan.json")
     else:
@@ -141,7 +141,7 @@ def test_a_damaged_plan_with_rows_is_refused_until_it_is_forced(folder, content)
     assert validate_dataset(folder).ok
 
 
-def test_force_works_where_the_plan_is_damaged_and_a_record_or_all_documents_are_lost(folder):
+def test_force_works_where_the_blueprint_is_damaged_and_a_record_or_all_documents_are_lost(folder):
     (folder / "plan.json").write_bytes(b"")
     for name in ("manifest.json", "stats.json", "README.md", "croissant.json", "validation/shard-00000.json"):
         (folder / name).unlink()
@@ -149,7 +149,7 @@ def test_force_works_where_the_plan_is_damaged_and_a_record_or_all_documents_are
     assert validate_dataset(folder).ok
 
 
-def test_force_works_where_the_plan_is_lost(folder):
+def test_force_works_where_the_blueprint_is_lost(folder):
     (folder / "plan.json").unlink()
     with pytest.raises(DatasetError, match=r"plan.json is missing; --force replaces the whole dataset"):
         make_tiny(folder)
@@ -161,15 +161,15 @@ def test_force_works_where_the_plan_is_lost(folder):
 
 
 @pytest.mark.parametrize("force", [False, True])
-@pytest.mark.parametrize("plan", [None, "", "{}", '{"terraform": 1}'])
-def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force, plan):
+@pytest.mark.parametrize("blueprint", [None, "", "{}", '{"terraform": 1}'])
+def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force, blueprint):
     (tmp_path / "thesis.tex").write_text("years of work")
     (tmp_path / "README.md").write_text("mine")
     (tmp_path / "train").mkdir()
     (tmp_path / "train" / "shard-00000.h5").write_text("somebody else's")
     (tmp_path / "train" / "shard-00000.json").write_text('{"weights": 3}')
-    if plan is not None:
-        (tmp_path / "plan.json").write_text(plan)
+    if blueprint is not None:
+        (tmp_path / "plan.json").write_text(blueprint)
     before = snapshot(tmp_path)
     with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another --out"):
         make_tiny(tmp_path, force=force)

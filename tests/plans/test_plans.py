@@ -374,8 +374,8 @@ def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
 
 def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
     for name, content, message in (
-        ("text.h5", b"hello", "damaged or cut off"),
-        ("empty.h5", b"", "damaged or cut off"),
+        ("text.h5", b"hello", "not an HDF5 file, or its beginning is damaged"),
+        ("empty.h5", b"", "not an HDF5 file, or its beginning is damaged"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DatasetError, match=rf"{name} is .*{message}|{name} {message}"):

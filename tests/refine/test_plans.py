@@ -216,7 +216,7 @@ def test_drawn_problems_are_those_of_the_seed_and_of_no_other_split(tmp_path: Pa
     assert not np.isin(some.boundary.start_q[:, 0], train.boundary.start_q[:, 0]).any()
     rows = load_problems(made.folder, split="validation", start=1, n=2)
     assert rows.sample_id.tolist() == [1, 2]
-    with pytest.raises(UsageError, match="no split 'trian'"):
+    with pytest.raises(UsageError, match=r"no split 'trian' \(did you mean 'train'\?\), only train"):
         load_problems(made.folder, split="trian")
     with pytest.raises(UsageError, match=r"has \d+ rows, got 1000 from row 0 on"):
         load_problems(made.folder, split="validation", n=1000)

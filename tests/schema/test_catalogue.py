@@ -363,7 +363,7 @@ def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
         ("rol", r"unknown pipeline 'rol' \(did you mean 'roll'\?\); known: roll"),
         ("", "unknown pipeline ''; known: roll"),
         ("arm", "unknown pipeline 'arm', which is a problem; known: roll"),
-        ("roll-1k", "unknown pipeline 'roll-1k', which is a dataset; known: roll"),
+        ("roll-1k", "unknown pipeline 'roll-1k': it is the name of a dataset; known: roll"),
         ("rolll.toml", r"no such file: rolll.toml \(did you mean 'roll'\?\)"),
         ("some/roll", "no such file: some/roll"),
         ("/", "/ is a folder, expected a .toml file"),
@@ -373,6 +373,29 @@ def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RecipeError, match=message):
         load_pipeline(text)
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "message"),
+    [
+        (
+            load_problem,
+            "airhockey-hit",
+            "unknown problem 'airhockey-hit': it is the name of a pipeline and a dataset; ",
+        ),
+        (load_pipeline, "airhockey", "unknown pipeline 'airhockey': it is the name of a problem; known: "),
+        (
+            load_dataset_recipe,
+            "airhockey",
+            "unknown dataset or pipeline 'airhockey': it is the name of a problem; known: ",
+        ),
+    ],
+)
+def test_a_name_of_another_kind_is_said_to_be_one(load, name, message):
+    with pytest.raises(RecipeError) as caught:
+        load(name)
+    (mistake,) = caught.value.mistakes
+    assert mistake.startswith(message)
 
 
 def test_a_file_without_suffix_is_a_path(shipped, tmp_path, monkeypatch):

@@ -13,11 +13,11 @@ from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, chec
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import save_document
 from cnpgen.store.manifest import finalize, load_manifest
-from tests.examples.store import PLAN, dataset, make_shard, make_shards
+from tests.examples.store import BLUEPRINT, dataset, make_shard, make_shards
 
 __all__ = ["dataset"]
 
-TASK = shards(PLAN)[0]
+TASK = shards(BLUEPRINT)[0]
 FILES = [
     "plan.json",
     "manifest.json",
@@ -38,7 +38,7 @@ def problems(folder: Path) -> dict[str, str]:
 def test_a_good_dataset_has_no_findings_and_every_shard_is_announced(dataset: Path) -> None:
     announced: list[str] = []
     assert check_dataset(dataset, progress=announced.append) == []
-    assert announced == [task.file for task in shards(PLAN)]
+    assert announced == [task.file for task in shards(BLUEPRINT)]
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -78,9 +78,9 @@ def test_a_byte_that_makes_hdf5_hang_is_found(dataset: Path) -> None:
 
 def test_a_shard_from_another_seed_is_named_as_such(tmp_path: Path, dataset: Path) -> None:
     other = tmp_path / "other"
-    make_shards(other, replace(PLAN, seed=5))
+    make_shards(other, replace(BLUEPRINT, seed=5))
     shutil.copy(other / TASK.file, dataset / TASK.file)
-    message = f"{TASK.file}: its root_seed is '5', plan.json says '{PLAN.seed}'"
+    message = f"{TASK.file}: its root_seed is '5', plan.json says '{BLUEPRINT.seed}'"
     assert message in [str(item) for item in check_dataset(dataset)]
     shutil.copy(other / TASK.sidecar, dataset / TASK.sidecar)
     texts = [str(item) for item in check_dataset(dataset)]
@@ -93,12 +93,12 @@ def test_a_shard_from_another_seed_is_named_as_such(tmp_path: Path, dataset: Pat
 
 
 def test_swapped_shards_are_found(dataset: Path) -> None:
-    first, last = dataset / TASK.file, dataset / shards(PLAN)[-1].file
+    first, last = dataset / TASK.file, dataset / shards(BLUEPRINT)[-1].file
     content = first.read_bytes()
     shutil.copy(last, first)
     last.write_bytes(content)
-    assert problems(dataset).keys() == {TASK.file, shards(PLAN)[-1].file}
-    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    assert problems(dataset).keys() == {TASK.file, shards(BLUEPRINT)[-1].file}
+    texts = [str(item) for item in check_content(dataset, BLUEPRINT, TASK)]
     assert any("its split is 'validation', plan.json says 'train'" in text for text in texts)
 
 
@@ -113,12 +113,12 @@ def test_swapped_shards_are_found(dataset: Path) -> None:
         (lambda file: file.attrs.__setitem__("first_sample_id", 3), "its first_sample_id is 3, plan.json says 0"),
     ],
 )
-def test_shards_that_contradict_the_plan_are_found(
+def test_shards_that_contradict_the_blueprint_are_found(
     dataset: Path, change: Callable[[h5py.File], object], message: str
 ) -> None:
     with h5py.File(dataset / TASK.file, "r+") as file:
         change(file)
-    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    texts = [str(item) for item in check_content(dataset, BLUEPRINT, TASK)]
     assert problems(dataset).keys() == {TASK.file}
     assert any(message in text for text in texts)
 
@@ -128,7 +128,7 @@ def test_a_shard_with_other_rows_or_types_is_found(dataset: Path) -> None:
         attributes = dict(file["clearance"].attrs)
         del file["clearance"]
         file.create_dataset("clearance", data=[0.0] * 31, dtype="<f4").attrs.update(attributes)
-    texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
+    texts = [str(item) for item in check_content(dataset, BLUEPRINT, TASK)]
     assert any("'clearance' is float32 of shape (31,), not float64" in text for text in texts)
 
 
@@ -142,12 +142,12 @@ def test_files_that_do_not_belong_to_the_dataset_are_notes(dataset: Path) -> Non
 
 
 def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, PLAN)
-    for task in shards(PLAN)[:2]:
-        make_shard(tmp_path, PLAN, task)
+    write_blueprint(tmp_path, BLUEPRINT)
+    for task in shards(BLUEPRINT)[:2]:
+        make_shard(tmp_path, BLUEPRINT, task)
     message = "is missing: the dataset is unfinished: 2 of 3 shards are there; run the same make-dataset command again"
     assert check_dataset(tmp_path) == [Finding("manifest.json", message, advice=MAKE_AGAIN)]
-    make_shard(tmp_path, PLAN, shards(PLAN)[2])
+    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[2])
     assert "unfinished: all shards are there, but they were not summed up" in problems(tmp_path)["manifest.json"]
 
 
@@ -156,18 +156,18 @@ def test_damage_to_an_unfinished_dataset_is_found(tmp_path: Path) -> None:
     path = tmp_path / TASK.file
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    (tmp_path / shards(PLAN)[1].sidecar).write_bytes(b"{")
-    assert problems(tmp_path).keys() == {"manifest.json", TASK.file, shards(PLAN)[1].sidecar}
+    (tmp_path / shards(BLUEPRINT)[1].sidecar).write_bytes(b"{")
+    assert problems(tmp_path).keys() == {"manifest.json", TASK.file, shards(BLUEPRINT)[1].sidecar}
 
 
 def test_a_damaged_manifest_does_not_hide_a_damaged_shard(dataset: Path) -> None:
     (dataset / "manifest.json").write_text("{")
     (dataset / TASK.file).unlink()
-    (dataset / shards(PLAN)[1].sidecar).unlink()
-    assert problems(dataset).keys() == {"manifest.json", TASK.file, shards(PLAN)[1].sidecar}
+    (dataset / shards(BLUEPRINT)[1].sidecar).unlink()
+    assert problems(dataset).keys() == {"manifest.json", TASK.file, shards(BLUEPRINT)[1].sidecar}
 
 
-def test_manifests_that_contradict_the_plan_or_themselves_are_found(tmp_path: Path, dataset: Path) -> None:
+def test_manifests_that_contradict_the_blueprint_or_themselves_are_found(tmp_path: Path, dataset: Path) -> None:
     good = load_manifest(dataset)
     cases = [
         ({"plan_fingerprint": "0" * 64}, "another blueprint"),
@@ -201,15 +201,15 @@ def test_every_finding_says_what_to_do_and_names_its_file_once(dataset: Path, na
 def test_changed_documents_are_found_without_reading_a_shard(
     dataset: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    assert check_documents(dataset, PLAN) == []
+    assert check_documents(dataset, BLUEPRINT) == []
     content = (dataset / name).read_bytes()
     (dataset / name).write_bytes(content[:-2] + b" " + content[-2:])
     read = []
     monkeypatch.setattr("cnpgen.store.check.file_sha256", lambda path: (read.append(path.suffix), file_sha256(path))[1])
-    assert [item.file for item in check_documents(dataset, PLAN)] == [name]
+    assert [item.file for item in check_documents(dataset, BLUEPRINT)] == [name]
     assert ".h5" not in read
 
 
 def test_a_dataset_that_is_finished_again_is_good(dataset: Path) -> None:
-    finalize(dataset, PLAN)
+    finalize(dataset, BLUEPRINT)
     assert check_dataset(dataset) == []

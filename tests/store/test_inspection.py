@@ -1,4 +1,4 @@
-"""Inspection: what the plan and the sidecars say is what the rows say, of whole and of unfinished datasets."""
+"""Inspection: what the blueprint and the sidecars say is what the rows say, of whole and of unfinished datasets."""
 
 import builtins
 import dataclasses
@@ -124,7 +124,7 @@ def test_a_document_that_is_not_as_it_was_written_is_damage(hits, tmp_path, name
 
 
 @pytest.mark.parametrize(("content", "message"), [(None, "plan.json is missing"), (b"{", "plan.json is damaged: ")])
-def test_without_its_plan_a_dataset_is_not_inspected_but_still_a_dataset(hits, tmp_path, content, message):
+def test_without_its_blueprint_a_dataset_is_not_inspected_but_still_a_dataset(hits, tmp_path, content, message):
     folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
     (folder / "plan.json").unlink()
     if content is not None:

@@ -19,7 +19,7 @@ from cnpgen.store.check import check_dataset
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
 from cnpgen.store.record import commit_shard
-from tests.examples.store import FIELDS, PLAN, dataset, make_columns, make_fates, make_shard, make_shards
+from tests.examples.store import BLUEPRINT, FIELDS, dataset, make_columns, make_fates, make_shard, make_shards
 
 __all__ = ["dataset"]
 
@@ -28,9 +28,9 @@ def test_the_manifest_says_what_the_dataset_is(dataset: Path) -> None:
     manifest = load_manifest(dataset)
     assert manifest["name"] == "two-shards"
     assert manifest["pipeline"] == "toy"
-    assert manifest["recipe"] == PLAN.recipe
-    assert manifest["seed"] == str(PLAN.seed)
-    assert manifest["plan_fingerprint"] == PLAN.fingerprint
+    assert manifest["recipe"] == BLUEPRINT.recipe
+    assert manifest["seed"] == str(BLUEPRINT.seed)
+    assert manifest["plan_fingerprint"] == BLUEPRINT.fingerprint
     assert manifest["features"]["start_q"]["shape"] == [3]
     assert manifest["features"]["start_q"]["units"] == "rad"
     assert manifest["features"]["clearance"]["shape"] == []
@@ -39,7 +39,7 @@ def test_the_manifest_says_what_the_dataset_is(dataset: Path) -> None:
     assert manifest["verification"] == {"plane": 2e-9}
     assert manifest["splits"]["train"]["rows"] == 50
     assert manifest["seconds"] == 1.5
-    assert manifest["environments"] == [dict(PLAN.versions)]
+    assert manifest["environments"] == [dict(BLUEPRINT.versions)]
 
 
 def test_the_manifest_lists_every_other_file_with_its_digest(dataset: Path) -> None:
@@ -61,7 +61,7 @@ def test_the_fingerprint_is_what_sha256sum_says(dataset: Path) -> None:
 
 def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
     stats = json.loads((dataset / "stats.json").read_text())
-    rows = np.concatenate([make_columns(task)["start_q"] for task in shards(PLAN) if task.split == "train"])
+    rows = np.concatenate([make_columns(task)["start_q"] for task in shards(BLUEPRINT) if task.split == "train"])
     found = stats["splits"]["train"]["start_q"]
     np.testing.assert_allclose(found["mean"], rows.mean(axis=0), rtol=1e-12)
     np.testing.assert_allclose(found["std"], rows.std(axis=0), rtol=1e-12)
@@ -73,48 +73,48 @@ def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
 
 def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
     before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
-    finalize(dataset, PLAN, notes="Some notes.")
+    finalize(dataset, BLUEPRINT, notes="Some notes.")
     assert {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()} == before
     assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
 
 
 def test_finishing_in_several_processes_at_once_gives_a_good_dataset(dataset: Path) -> None:
     with multiprocessing.get_context("spawn").Pool(3) as pool:
-        manifests = pool.starmap(finalize, [(dataset, PLAN)] * 9)
+        manifests = pool.starmap(finalize, [(dataset, BLUEPRINT)] * 9)
     assert check_dataset(dataset) == []
     assert manifests == [load_manifest(dataset)] * 9
 
 
 def test_records_without_a_start_are_dated_by_the_clock_and_nonsense_is_refused(tmp_path: Path) -> None:
-    plan = replace(PLAN, splits={"train": 10})
-    task = shards(plan)[0]
+    blueprint = replace(BLUEPRINT, splits={"train": 10})
+    task = shards(blueprint)[0]
     for started, good in (("", True), ("yesterday", False)):
         folder = tmp_path / str(good)
-        write_blueprint(folder, plan)
-        commit_shard(folder, plan, task, columns=make_columns(task), fates=make_fates(task), started=started)
+        write_blueprint(folder, blueprint)
+        commit_shard(folder, blueprint, task, columns=make_columns(task), fates=make_fates(task), started=started)
         if good:
-            assert finalize(folder, plan)["created"].endswith("Z")
+            assert finalize(folder, blueprint)["created"].endswith("Z")
         else:
             with pytest.raises(DatasetError, match="yesterday"):
-                finalize(folder, plan)
+                finalize(folder, blueprint)
 
 
 def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1763690000")
-    assert finalize(dataset, PLAN)["created"] == "2025-11-21T01:53:20Z"
+    assert finalize(dataset, BLUEPRINT)["created"] == "2025-11-21T01:53:20Z"
     first = (dataset / "manifest.json").read_bytes()
-    finalize(dataset, PLAN)
+    finalize(dataset, BLUEPRINT)
     assert (dataset / "manifest.json").read_bytes() == first
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     with pytest.raises(UsageError, match="SOURCE_DATE_EPOCH must be whole seconds since 1970, got 'yesterday'"):
-        finalize(dataset, PLAN)
+        finalize(dataset, BLUEPRINT)
 
 
 def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, PLAN)
-    make_shard(tmp_path, PLAN, shards(PLAN)[1])
+    write_blueprint(tmp_path, BLUEPRINT)
+    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
     with pytest.raises(DatasetError) as caught:
-        finalize(tmp_path, PLAN)
+        finalize(tmp_path, BLUEPRINT)
     assert "1 of 3 shards are there; run the same make-dataset command again" in str(caught.value)
     assert "train/shard-00000.json is missing" in str(caught.value)
     assert "validation/shard-00000.json is missing" in str(caught.value)
@@ -124,18 +124,18 @@ def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_pa
 
 def test_a_long_list_of_missing_shards_is_cut_short(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="and 5 more"):
-        finalize(tmp_path, replace(PLAN, splits={"train": 320}))
+        finalize(tmp_path, replace(BLUEPRINT, splits={"train": 320}))
 
 
 def test_shards_of_another_seed_and_cut_off_shards_are_refused(tmp_path: Path) -> None:
     make_shards(tmp_path)
-    make_shard(tmp_path, replace(PLAN, seed=1), shards(PLAN)[0])
-    path = tmp_path / shards(PLAN)[1].file
+    make_shard(tmp_path, replace(BLUEPRINT, seed=1), shards(BLUEPRINT)[0])
+    path = tmp_path / shards(BLUEPRINT)[1].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
         DatasetError, match=r"(?s)00000\.json belongs to another blueprint.*00001\.h5 is not the recorded file"
     ):
-        finalize(tmp_path, PLAN)
+        finalize(tmp_path, BLUEPRINT)
 
 
 @pytest.mark.parametrize("step", ["save_document", "write_file", "_manifest"])
@@ -147,10 +147,10 @@ def test_a_finalize_that_is_killed_leaves_no_manifest(
 
     monkeypatch.setattr(manifest_module, step, killed)
     with pytest.raises(KeyboardInterrupt):
-        finalize(dataset, PLAN)
+        finalize(dataset, BLUEPRINT)
     assert not (dataset / "manifest.json").exists()
     monkeypatch.undo()
-    finalize(dataset, PLAN)
+    finalize(dataset, BLUEPRINT)
     assert (dataset / "manifest.json").exists()
 
 
@@ -161,7 +161,7 @@ def test_a_full_disk_while_finishing_is_a_machine_error(tmp_path: Path, monkeypa
     make_shards(tmp_path)
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(MachineError, match=r"stats\.json"):
-        finalize(tmp_path, PLAN)
+        finalize(tmp_path, BLUEPRINT)
     assert not (tmp_path / "manifest.json").exists()
 
 
@@ -173,7 +173,7 @@ def test_damaged_manifests_are_refused(dataset: Path, damage: bytes) -> None:
 
 
 def test_datasets_with_an_empty_split_are_finished_like_any_other(tmp_path: Path) -> None:
-    blueprint = replace(PLAN, splits={"train": 20, "validation": 0})
+    blueprint = replace(BLUEPRINT, splits={"train": 20, "validation": 0})
     make_shards(tmp_path, blueprint)
     manifest = finalize(tmp_path, blueprint)
     assert manifest["splits"]["validation"]["shards"] == []
@@ -184,7 +184,7 @@ def test_croissant_lists_the_files_and_promises_no_records(dataset: Path) -> Non
     croissant = json.loads((dataset / "croissant.json").read_text())
     assert "recordSet" not in croissant
     assert croissant["license"] == "https://spdx.org/licenses/CC-BY-4.0"
-    assert [item["contentUrl"] for item in croissant["distribution"]] == [task.file for task in shards(PLAN)]
+    assert [item["contentUrl"] for item in croissant["distribution"]] == [task.file for task in shards(BLUEPRINT)]
     for item in croissant["distribution"]:
         content = (dataset / item["contentUrl"]).read_bytes()
         assert item["encodingFormat"] == "application/x-hdf5"

@@ -16,16 +16,16 @@ from cnpgen.store import intact
 from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
-from tests.examples.store import PLAN, dataset, make_columns, make_shard
+from tests.examples.store import BLUEPRINT, dataset, make_columns, make_shard
 
 __all__ = ["dataset"]
 
-TRAIN = [make_columns(task) for task in shards(PLAN) if task.split == "train"]
+TRAIN = [make_columns(task) for task in shards(BLUEPRINT) if task.split == "train"]
 
 
-def test_rows_come_back_in_order_and_in_the_plan_s_field_order(dataset: Path) -> None:
+def test_rows_come_back_in_order_and_in_the_blueprint_s_field_order(dataset: Path) -> None:
     rows = open_dataset(dataset).read("train")
-    assert list(rows) == [field.name for field in PLAN.fields]
+    assert list(rows) == [field.name for field in BLUEPRINT.fields]
     for name, values in rows.items():
         assert np.array_equal(values, np.concatenate([part[name] for part in TRAIN]))
 
@@ -54,15 +54,17 @@ def test_rows_that_do_not_exist_are_refused(dataset: Path, start: int, stop: int
 
 def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
     opened = open_dataset(dataset)
-    with pytest.raises(DatasetError, match="did you mean 'validation'"):
-        opened.read("valid")
+    for split in ("val", "valid"):
+        message = rf"has no split '{split}' \(did you mean 'validation'\?\), only train, validation$"
+        with pytest.raises(DatasetError, match=message):
+            opened.read(split)
     with pytest.raises(DatasetError, match="did you mean 'start_q'"):
         opened.read("train", fields=["start_dq"])
 
 
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, PLAN)
-    make_shard(tmp_path, PLAN, shards(PLAN)[1])
+    write_blueprint(tmp_path, BLUEPRINT)
+    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run the same"):
         open_dataset(tmp_path)
     opened = open_dataset(tmp_path, allow_incomplete=True)
@@ -72,7 +74,7 @@ def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
 
 
 def test_damaged_parts_are_refused(dataset: Path) -> None:
-    path = dataset / shards(PLAN)[0].file
+    path = dataset / shards(BLUEPRINT)[0].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
         DatasetError, match=r"shard-00000\.h5 has \d+ bytes instead of \d+; run the same make-dataset command again"
@@ -94,7 +96,7 @@ def change_a_number(path: Path, field: str = "start_q") -> None:
 
 @pytest.mark.parametrize("finished", [True, False])
 def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset: Path, finished: bool) -> None:
-    second = shards(PLAN)[1]
+    second = shards(BLUEPRINT)[1]
     change_a_number(dataset / second.file)
     if not finished:
         (dataset / "manifest.json").unlink()
@@ -116,7 +118,7 @@ def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypat
     for _ in range(3):
         open_dataset(dataset).read("train", stop=1)
     assert hashed == ["shard-00000.h5"]
-    path = dataset / shards(PLAN)[0].file
+    path = dataset / shards(BLUEPRINT)[0].file
     change_a_number(path)
     os.utime(path, ns=(0, 0))
     with pytest.raises(DatasetError, match="sha256"):
@@ -127,7 +129,7 @@ def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypat
 def test_a_folder_that_mixes_two_datasets_is_refused(tmp_path: Path, dataset: Path) -> None:
     from dataclasses import replace
 
-    write_blueprint(tmp_path / "other", replace(PLAN, seed=1))
+    write_blueprint(tmp_path / "other", replace(BLUEPRINT, seed=1))
     (dataset / "plan.json").write_bytes((tmp_path / "other" / "plan.json").read_bytes())
     with pytest.raises(DatasetError, match="mixes two datasets"):
         open_dataset(dataset)

@@ -26,14 +26,14 @@ from cnpgen.store.record import (
     record_to_json,
     save_record,
 )
-from tests.examples.store import PLAN, make_columns, make_fates, make_shard, make_shards
+from tests.examples.store import BLUEPRINT, make_columns, make_fates, make_shard, make_shards
 
-TASK = shards(PLAN)[0]
+TASK = shards(BLUEPRINT)[0]
 
 
 def test_a_committed_shard_has_a_record_that_describes_it(tmp_path: Path) -> None:
-    record = make_shard(tmp_path, PLAN, TASK)
-    assert is_committed(tmp_path, TASK, PLAN.fingerprint)
+    record = make_shard(tmp_path, BLUEPRINT, TASK)
+    assert is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
     assert record_to_json(load_record(tmp_path, TASK)) == record_to_json(record)
     assert record.sha256 == file_sha256(tmp_path / "train/shard-00000.h5")
     assert record.bytes == (tmp_path / "train/shard-00000.h5").stat().st_size
@@ -43,15 +43,15 @@ def test_a_committed_shard_has_a_record_that_describes_it(tmp_path: Path) -> Non
 
 
 def test_making_a_shard_twice_gives_the_same_bytes(tmp_path: Path) -> None:
-    first = make_shard(tmp_path, PLAN, TASK)
+    first = make_shard(tmp_path, BLUEPRINT, TASK)
     (tmp_path / TASK.sidecar).unlink()
-    assert make_shard(tmp_path, PLAN, TASK).sha256 == first.sha256
+    assert make_shard(tmp_path, BLUEPRINT, TASK).sha256 == first.sha256
 
 
 def test_a_committed_shard_and_its_sidecar_are_not_written_again(tmp_path: Path) -> None:
-    make_shard(tmp_path, PLAN, TASK)
+    make_shard(tmp_path, BLUEPRINT, TASK)
     before = [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)]
-    record = commit_shard(tmp_path, PLAN, TASK, columns=make_columns(TASK), fates=make_fates(TASK), seconds=9.0)
+    record = commit_shard(tmp_path, BLUEPRINT, TASK, columns=make_columns(TASK), fates=make_fates(TASK), seconds=9.0)
     assert record.seconds == 0.5
     assert [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)] == before
 
@@ -66,15 +66,15 @@ def test_the_shard_is_there_before_its_sidecar(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(MachineError, match=r"shard-00000\.json"):
-        make_shard(tmp_path, PLAN, TASK)
+        make_shard(tmp_path, BLUEPRINT, TASK)
     assert [path.name for path in (tmp_path / "train").iterdir()] == ["shard-00000.h5"]
-    assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
+    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
 
 
 def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> None:
     columns = make_columns(TASK) | {"clearance": np.full(32, np.nan)}
     with pytest.raises(DatasetError, match="not finite"):
-        commit_shard(tmp_path, PLAN, TASK, columns=columns, fates=make_fates(TASK))
+        commit_shard(tmp_path, BLUEPRINT, TASK, columns=columns, fates=make_fates(TASK))
     assert not list(tmp_path.rglob("*"))
 
 
@@ -83,17 +83,17 @@ def test_a_run_that_finishes_the_dataset_does_not_stop_another_one_in_the_middle
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flush: int
 ) -> None:
     sync, calls = os.fsync, count()
-    write_blueprint(tmp_path, PLAN)
+    write_blueprint(tmp_path, BLUEPRINT)
 
     def meanwhile(descriptor: int) -> None:
         if next(calls) == flush:
             make_shards(tmp_path)
-            finalize(tmp_path, PLAN)
+            finalize(tmp_path, BLUEPRINT)
         sync(descriptor)
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", meanwhile)
-        record = make_shard(tmp_path, PLAN, TASK)
+        record = make_shard(tmp_path, BLUEPRINT, TASK)
     assert record.sha256 == file_sha256(tmp_path / TASK.file)
     assert not list(tmp_path.rglob("*.tmp"))
     assert check_dataset(tmp_path) == []
@@ -106,39 +106,39 @@ def test_a_run_that_finishes_the_dataset_does_not_stop_another_one_in_the_middle
 def test_a_damaged_shard_or_sidecar_is_not_committed(
     tmp_path: Path, name: str, action: Callable[[bytes], bytes]
 ) -> None:
-    make_shard(tmp_path, PLAN, TASK)
+    make_shard(tmp_path, BLUEPRINT, TASK)
     (tmp_path / name).write_bytes(action((tmp_path / name).read_bytes()))
-    assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
+    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
     with pytest.raises(DatasetError, match=name.split("/")[1]):
-        load_committed(tmp_path, TASK, PLAN.fingerprint)
+        load_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
 
 
 def test_a_flipped_digit_in_a_sidecar_is_noticed(tmp_path: Path) -> None:
-    make_shard(tmp_path, PLAN, TASK)
+    make_shard(tmp_path, BLUEPRINT, TASK)
     path = tmp_path / TASK.sidecar
     path.write_bytes(path.read_bytes().replace(b'"tried": 64', b'"tried": 65'))
     with pytest.raises(DatasetError, match="changed after it was written"):
         load_record(tmp_path, TASK)
 
 
-def test_missing_shards_and_those_of_another_plan_are_not_committed(tmp_path: Path) -> None:
-    assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
-    make_shard(tmp_path, PLAN, TASK)
+def test_missing_shards_and_those_of_another_blueprint_are_not_committed(tmp_path: Path) -> None:
+    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+    make_shard(tmp_path, BLUEPRINT, TASK)
     with pytest.raises(DatasetError, match="another blueprint"):
-        load_committed(tmp_path, TASK, replace(PLAN, seed=1).fingerprint)
+        load_committed(tmp_path, TASK, replace(BLUEPRINT, seed=1).fingerprint)
     (tmp_path / TASK.file).unlink()
-    assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
+    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
 
 
 def test_a_sidecar_of_another_shard_is_refused(tmp_path: Path) -> None:
     make_shards(tmp_path)
-    (tmp_path / shards(PLAN)[1].sidecar).replace(tmp_path / TASK.sidecar)
+    (tmp_path / shards(BLUEPRINT)[1].sidecar).replace(tmp_path / TASK.sidecar)
     with pytest.raises(DatasetError, match="record of another shard: train/shard-00001"):
         load_record(tmp_path, TASK)
 
 
 def test_a_sidecar_without_its_keys_is_refused(tmp_path: Path) -> None:
-    record = make_shard(tmp_path, PLAN, TASK)
+    record = make_shard(tmp_path, BLUEPRINT, TASK)
     for change in ({"statistics": {"a": {}}}, {"outcome": {}}, {"outcome": 3}):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("cnpgen.store.record.record_to_json", lambda _, c=change: record_to_json(record) | c)
@@ -148,11 +148,11 @@ def test_a_sidecar_without_its_keys_is_refused(tmp_path: Path) -> None:
 
 
 def test_pending_lists_what_is_still_to_be_made(tmp_path: Path) -> None:
-    assert pending(tmp_path, PLAN) == shards(PLAN)
+    assert pending(tmp_path, BLUEPRINT) == shards(BLUEPRINT)
     make_shards(tmp_path)
-    assert pending(tmp_path, PLAN) == []
+    assert pending(tmp_path, BLUEPRINT) == []
     (tmp_path / TASK.sidecar).unlink()
-    assert pending(tmp_path, PLAN) == [TASK]
+    assert pending(tmp_path, BLUEPRINT) == [TASK]
 
 
 def test_fates_survive_json() -> None:

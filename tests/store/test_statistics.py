@@ -19,7 +19,7 @@ from cnpgen.store.statistics import (
     merge_statistics,
     statistics_from_json,
 )
-from tests.examples.store import FIELDS, PLAN, make_columns
+from tests.examples.store import BLUEPRINT, FIELDS, make_columns
 
 FIELD = Field("q", "rad", "positions", 4, valid_min=(-3.0, 0.0, 5.0, -1.0), valid_max=(3.0, 1.0, 5.0, 1.0))
 
@@ -100,7 +100,7 @@ def test_limits_of_another_width_are_refused() -> None:
 
 
 def test_statistics_survive_json_exactly() -> None:
-    found = column_statistics(make_columns(shards(PLAN)[0]), FIELDS)
+    found = column_statistics(make_columns(shards(BLUEPRINT)[0]), FIELDS)
     assert list(found) == [field.name for field in FIELDS]
     for item in found.values():
         content: dict[str, Any] = item.to_json()

@@ -24,8 +24,8 @@ def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def problem_of(folder: Path) -> str:
-    plan = load_blueprint(folder)
-    found = make_again(folder, plan, shards(plan)[:1], 3)
+    blueprint = load_blueprint(folder)
+    found = make_again(folder, blueprint, shards(blueprint)[:1], 3)
     assert (found.made, found.blocks, found.identical) == (1, 1, 0)
     (finding,) = found.findings
     return finding.problem
@@ -47,5 +47,5 @@ def test_other_libraries_are_an_explanation(different, monkeypatch):
 
 
 def test_the_same_code_makes_the_same_bits(damaged):
-    plan = load_blueprint(damaged)
-    assert make_again(damaged, plan, shards(plan), 2) == Regeneration(made=2, blocks=4, identical=2)
+    blueprint = load_blueprint(damaged)
+    assert make_again(damaged, blueprint, shards(blueprint), 2) == Regeneration(made=2, blocks=4, identical=2)

@@ -51,13 +51,13 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
     task = task_of(folder, file)
     with h5py.File(folder / file, "r+") as shard:
         change(shard)
-    record, plan = load_record(folder, task), load_blueprint(folder)
+    record, blueprint = load_record(folder, task), load_blueprint(folder)
     columns, statistics = read_shard(folder / file), record.statistics
-    if len(columns) == len(plan.fields) and all(np.isfinite(values).all() for values in columns.values()):
-        statistics = column_statistics(columns, plan.fields)
+    if len(columns) == len(blueprint.fields) and all(np.isfinite(values).all() for values in columns.values()):
+        statistics = column_statistics(columns, blueprint.fields)
     size, digest = (folder / file).stat().st_size, file_sha256(folder / file)
     save_record(folder, task, replace(record, bytes=size, sha256=digest, statistics=statistics))
-    finalize(folder, plan)
+    finalize(folder, blueprint)
 
 
 # --- good datasets ----------------------------------------------------------------------------------------------------
@@ -359,7 +359,7 @@ def test_made_again_are_all_rows_of_shards_that_begin_within_a_block(tmp_path):
         assert not validate_dataset(folder, regenerate=40).ok, row
 
 
-def test_the_backend_of_the_plan_makes_the_blocks_again(tmp_path):
+def test_the_backend_of_the_blueprint_makes_the_blocks_again(tmp_path):
     make_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out", workers=1, backend="numpy")
     report = validate_dataset(tmp_path / "out", regenerate=2)
     assert (report.ok, report.identical) == (True, 2)
@@ -403,11 +403,11 @@ def test_a_backend_that_does_not_work_here_is_a_machine_error(damaged: Path, mon
     assert validate_dataset(damaged, deep=True, workers=1).ok
 
 
-def test_the_robot_of_the_plan_is_used_and_not_the_one_that_is_shipped(damaged: Path):
-    """What is validated is what the dataset says it is: its plan holds recipe and URDF."""
+def test_the_robot_of_the_blueprint_is_used_and_not_the_one_that_is_shipped(damaged: Path):
+    """What is validated is what the dataset says it is: its blueprint holds recipe and URDF."""
     robot = load_robot(load_problem("airhockey"))
     with h5py.File(damaged / "train/shard-00000.h5") as shard:
         q, xyz = shard["start_q"][0], shard["start_xyz"][0]
     np.testing.assert_allclose(Arm(robot).pose(q).translation, xyz, atol=1e-9)
-    plan = load_blueprint(damaged)
-    assert plan.robot["urdf"] == robot.urdf.read_text()
+    blueprint = load_blueprint(damaged)
+    assert blueprint.robot["urdf"] == robot.urdf.read_text()

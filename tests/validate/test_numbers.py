@@ -21,9 +21,9 @@ Parts = tuple[Blueprint, ShardTask, Columns, ShardRecord]
 
 
 def parts(folder: Path, index: int = 1) -> Parts:
-    plan = load_blueprint(folder)
-    task = shards(plan)[index]
-    return plan, task, read_shard(folder / task.file), load_record(folder, task)
+    blueprint = load_blueprint(folder)
+    task = shards(blueprint)[index]
+    return blueprint, task, read_shard(folder / task.file), load_record(folder, task)
 
 
 @pytest.fixture
@@ -34,9 +34,11 @@ def shard(tiny: Callable[[str], Path]) -> Parts:
 
 def changed(shard: Parts, name: str, where: Any, value: Any) -> list[str]:
     """What is found after a change that the statistics know of."""
-    plan, task, columns, record = shard
+    blueprint, task, columns, record = shard
     columns[name][where] = value
-    return check_numbers(plan, task, columns, replace(record, statistics=column_statistics(columns, plan.fields)))
+    return check_numbers(
+        blueprint, task, columns, replace(record, statistics=column_statistics(columns, blueprint.fields))
+    )
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -87,9 +89,9 @@ def test_rows_must_be_counted_and_draws_add_up(shard):
 
 
 def test_statistics_must_be_those_of_the_values(shard):
-    plan, task, columns, record = shard
+    blueprint, task, columns, record = shard
     columns["hit_angle"][9] *= 0.99
-    assert check_numbers(plan, task, columns, record) == [
+    assert check_numbers(blueprint, task, columns, record) == [
         "the recorded statistics of hit_angle are not those of its values"
     ]
 
@@ -98,9 +100,9 @@ def test_statistics_must_be_those_of_the_values(shard):
     ("what", "by", "wrong"), [("mean", 1e-12, 0), ("mean", 1e-6, 1), ("m2", 1e-12, 0), ("m2", 1e-6, 1)]
 )
 def test_sums_may_differ_in_their_last_digits_only(shard, what, by, wrong):
-    plan, task, columns, record = shard
+    blueprint, task, columns, record = shard
     item = record.statistics["hit_speed"]
     record = replace(
         record, statistics={**record.statistics, "hit_speed": replace(item, **{what: getattr(item, what) * (1 + by)})}
     )
-    assert len(check_numbers(plan, task, columns, record)) == wrong
+    assert len(check_numbers(blueprint, task, columns, record)) == wrong

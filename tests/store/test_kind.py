@@ -1,0 +1,75 @@
+"""What is given as an HDF5 file and is none says what it seems to be."""
+
+import gzip
+import io
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.cli.main import main
+from cnpgen.errors import DatasetError
+from cnpgen.plans import load_plans
+from cnpgen.store.files.hdf5 import opened_foreign_hdf5, opened_hdf5
+from cnpgen.store.files.kind import seeming
+from cnpgen.store.files.sealed import read_sealed
+from cnpgen.store.shard import read_shard
+
+
+def archive() -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, q=np.zeros(3))
+    return buffer.getvalue()
+
+
+def array() -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(3))
+    return buffer.getvalue()
+
+
+FILES = {
+    "text": (b"start_q, goal_q\n0.1, 0.2\n", ": it seems to be a text file"),
+    "long text": (b"a" + "é".encode() * 1000, ": it seems to be a text file"),  # cut in the middle of a character
+    "npz": (archive(), ": it seems to be a zip archive, as .npz files are"),
+    "npy": (array(), ": it seems to be an array of NumPy"),
+    "gzip": (gzip.compress(b"1"), ": it seems to be a gzip archive"),
+    "journal": (b"cnpgen journal 1\n\0\0", ": it seems to be a journal of cnpgen"),
+    "empty": (b"", ": it is empty"),
+    "noise": (bytes(range(1, 200)), ""),
+}
+
+
+@pytest.mark.parametrize("what", FILES)
+@pytest.mark.parametrize("opened", [opened_hdf5, opened_foreign_hdf5])
+def test_what_is_no_hdf5_file_is_not_called_cut_off(tmp_path: Path, opened, what: str) -> None:
+    content, said = FILES[what]
+    path = tmp_path / "given.h5"
+    path.write_bytes(content)
+    assert seeming(path) == said
+    with pytest.raises(DatasetError) as caught, opened(path):
+        pass
+    assert str(caught.value) == f"{path} is not an HDF5 file, or its beginning is damaged{said}"
+
+
+def test_every_reader_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "notes.h5"
+    path.write_text("mine")
+    for read in (load_plans, read_shard):
+        with pytest.raises(DatasetError, match=r"notes\.h5 is not an HDF5 file.*: it seems to be a text file$"):
+            read(path)
+    with pytest.raises(DatasetError, match=r"is not a model of cnpgen, .*: it seems to be a text file$"):
+        read_sealed(path, kind="cnpgen-model", version=1)
+    assert main(["evaluate", str(path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is not an HDF5 file" in line
+
+
+def test_an_hdf5_file_that_is_cut_off_is_called_so(tmp_path: Path) -> None:
+    path = tmp_path / "cut.h5"
+    with h5py.File(path, "w") as file:
+        file["x"] = np.arange(10_000.0)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(DatasetError, match=r"cut\.h5 is damaged or cut off: "):
+        read_shard(path)
