@@ -31,6 +31,7 @@ from cnpgen.robots.robot import Robot
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
 TINY_SHARD = 250
+HANGING = 1800  # [s] what takes longer hangs, on the slowest machine, too
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 
