@@ -5,6 +5,7 @@ import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
     os.environ[_variable] = "1"  # before NumPy is imported: its result must not depend on the machine's load
+os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: workers only where a test asks for them
 
 import shutil
 import signal
@@ -31,6 +32,7 @@ from cnpgen.robots.robot import Robot
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
 TINY_SHARD = 250
+HANGING = 1800  # [s] what takes longer hangs, on the slowest machine, too
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 

@@ -17,6 +17,7 @@ import cnpgen
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible, raise_if_interrupted
 from cnpgen.cli.main import main
 from cnpgen.kernels.compiled import find_compiler
+from tests.conftest import HANGING
 from tests.machine.test_workers import alive
 
 KEPT = "finished shards are kept, run the same command again to go on"
@@ -40,7 +41,7 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def wait_for(condition, seconds: float = 60.0) -> None:
+def wait_for(condition, seconds: float = HANGING) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
@@ -62,12 +63,12 @@ def making(folder: Path, workers: int, rows: str = "5e6") -> Iterator[subprocess
 
 def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list[int]) -> str:
     """Wait for the end of an interrupted process and check what it says and leaves; return its other lines."""
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=HANGING)
     what, code = NAMES[number]
     *others, last = err.splitlines()
     assert (last, out) == (f"cnpgen: {what}: {KEPT}", "")
     assert process.returncode in {code, -number}  # the latter where a second signal came in its very last moment
-    wait_for(lambda: not any(map(alive, offspring)), 10)
+    wait_for(lambda: not any(map(alive, offspring)))
     return "\n".join(others)
 
 
@@ -126,7 +127,7 @@ def test_a_killed_run_leaves_no_worker_and_only_whole_shards(tmp_path):
         wait_for(lambda: len(list(folder.glob("train/*.json"))) >= 2)
         offspring = descendants(process.pid)
         process.kill()
-        wait_for(lambda: not any(map(alive, offspring)), 10)
+        wait_for(lambda: not any(map(alive, offspring)))
         process.communicate()
     command = [sys.executable, "-m", "cnpgen", "validate", str(folder)]
     validated = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)

@@ -26,6 +26,7 @@ from cnpgen.make.blueprint import MAX_ROWS
 from cnpgen.store.check import Finding
 from cnpgen.store.fates import Fates
 from cnpgen.validate.dataset import ValidationReport
+from tests.conftest import HANGING
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
 MAKE = ("make-dataset", "airhockey-hit", "--n", "200", "--workers", "1", "--out")
@@ -358,11 +359,10 @@ def test_what_a_signal_interrupts_is_kept(tmp_path):
     folder = tmp_path / "many"
     words = ("make-dataset", "airhockey-hit", "--n", "2e6", "--shard-size", "4096", "--workers", "1", "--out", folder)
     process = spawn("-m", "cnpgen", *words)
-    deadline = time.monotonic() + 120
-    while not (folder / "train" / "shard-00001.json").exists() and time.monotonic() < deadline:
+    while not (folder / "train" / "shard-00001.json").exists() and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=HANGING)
     assert (process.returncode, out) == (130, "")
     assert "Traceback" not in err
     assert "finished shards are kept" in err

@@ -17,7 +17,7 @@ from cnpgen.cli.main import main
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
 from cnpgen.plans.status import PlanStatus
-from tests.conftest import columns_of
+from tests.conftest import HANGING, columns_of
 
 SMALL = ["--steps", "40", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--workers", "1"]
 
@@ -112,12 +112,11 @@ def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_pa
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL[2:], "--steps", "1e5", "--quiet"]
     command = [sys.executable, "-m", "cnpgen", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 60
         log = tmp_path / "m.jsonl"
-        while not (log.exists() and log.read_text()) and time.monotonic() < deadline:
+        while not (log.exists() and log.read_text()) and process.poll() is None:
             time.sleep(0.05)
         process.send_signal(getattr(signal, number))
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=HANGING)
     kept = f"{tmp_path / 'm.checkpoint'} keeps the run, run the same command again to go on"
     assert (process.returncode, out, err) == (code, "", f"cnpgen: {what}: {kept}\n")
     assert (tmp_path / "m.checkpoint").exists()

@@ -3,6 +3,7 @@
 import configparser
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -13,10 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.make.dataset import make_dataset
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
+from tests.conftest import HANGING
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -46,7 +49,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 def run(command: list[str], folder: Path, code: int = 0) -> str:
     done = subprocess.run(
-        command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=600, check=False
+        command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=HANGING, check=False
     )
     assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
     return done.stdout if code == 0 else done.stdout + done.stderr
@@ -59,12 +62,17 @@ def test_every_block_says_what_it_is() -> None:
             assert language != "toml" or "file" in marks, f"{page.name}: a TOML block must be a file: {text[:60]}"
 
 
+@pytest.fixture(scope="session")
+def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What blocks that are marked so find in their folder: some hits."""
+    return make_dataset("airhockey-hit", tmp_path_factory.mktemp("needed") / "hits", n=400, workers=1).folder
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_the_blocks_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
+def test_the_blocks_of_a_page_run_in_order(page: Path, needed: Path, tmp_path: Path) -> None:
     for marks, language, text in blocks(page):
         if "needs" in marks and not (tmp_path / marks["needs"]).exists():
-            out = ["--n", "400", "--workers", "1", "--out", marks["needs"]]
-            run([sys.executable, "-m", "cnpgen", "make-dataset", "airhockey-hit", *out], tmp_path)
+            shutil.copytree(needed, tmp_path / marks["needs"])
         if "library" in marks and find_spec(marks["library"]) is None:
             continue  # .ci/run or the extended run has it
         if "install" in marks or "test" in marks:

@@ -1,5 +1,6 @@
 """Small models for the tests: trained for a moment on the small datasets, once per session."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.kit import Surroundings, make_kit
-from cnpgen.planner.landing import make_landing
+from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.problems.record import record_problem
@@ -31,6 +32,18 @@ def surroundings_of(name: str) -> Surroundings:
     robot, (backend, folder) = load_robot(problem), choose_backend()
     kernels = problem_kernels(problem, robot, backend, folder)
     return Surroundings(record_problem(problem), problem, robot, kernels)
+
+
+def interpreted(given: Surroundings) -> Surroundings:
+    """The same with kernels that are interpreted: for a few plans that is quicker than compiling them."""
+    return replace(given, kernels=replace(given.kernels, backend="numpy"))
+
+
+@cache
+def landing_of(name: str) -> Landing:
+    """The landing of a shipped problem; compiling that of transports takes longer than all tests of it do."""
+    given = interpreted(surroundings_of(name)) if name == "heavy-object" else surroundings_of(name)
+    return make_landing(given.problem, given.kernels, steps=1)
 
 
 def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
@@ -69,11 +82,10 @@ def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingS
     """What one step of training needs, in float32 or float64."""
     given = surroundings_of(name)
     kit = make_kit(given, bending_steps=settings.bending_steps, landing_steps=settings.landing_steps, slow_down=False)
-    landing = make_landing(given.problem, given.kernels, steps=settings.landing_steps)
     rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
     loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
     architecture = architecture_of(given, rows, settings)
-    return Learner(architecture, given.problem.trajectory, loss, settings, landing), rows
+    return Learner(architecture, given.problem.trajectory, loss, settings, landing_of(name)), rows
 
 
 def model_path(folder: Path) -> Path:

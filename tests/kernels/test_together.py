@@ -13,7 +13,7 @@ from cnpgen.kernels.compiled import CompiledKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import Tape
 from cnpgen.kernels.together import PendingKernel
-from tests.conftest import needs_compiler
+from tests.conftest import HANGING, needs_compiler
 
 pytestmark = needs_compiler
 
@@ -68,7 +68,7 @@ def test_equal_tapes_are_compiled_once_and_cached_ones_not_at_all(tmp_path, comp
 
 def test_they_are_compiled_at_the_same_time(tmp_path, monkeypatch):
     """Two compilers that wait for each other: one by one they would wait for ever."""
-    meeting = threading.Barrier(2, timeout=30)
+    meeting = threading.Barrier(2, timeout=HANGING)
     real = together.compile_tape
 
     def compile_tape(tape: Tape, folder: Path) -> Path:

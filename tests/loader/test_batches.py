@@ -17,6 +17,7 @@ from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.loader.shards import Shard, ShardReader
+from tests.conftest import HANGING
 from tests.examples.loader import ALL, columns, ids, make, same
 
 SIZES = {  # rows and rows per shard
@@ -372,7 +373,7 @@ def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, m
     read = record_reads(monkeypatch)
     rest = iter(plain.batches(1))
     next(rest)
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + HANGING
     while len({shard.path for shard, _, _ in read}) < len(plain.shards["train"]):
         time.sleep(0.001)  # the second of two windows is read although nobody asked for it yet
         assert time.monotonic() < deadline

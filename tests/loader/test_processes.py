@@ -14,6 +14,7 @@ from cnpgen.loader import kept, order
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
+from tests.conftest import HANGING
 from tests.examples.loader import ALL, ids, make
 
 
@@ -105,7 +106,7 @@ def test_a_loop_that_is_left_leaves_no_thread_behind(dataset: Dataset) -> None:
     before = threading.active_count()
     for _ in range(5):
         next(iter(dataset.batches(5)))
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + HANGING
     while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.001)
     assert threading.active_count() == before

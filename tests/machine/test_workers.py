@@ -14,6 +14,7 @@ import pytest
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine.workers import _signals_held, share_out, worker_count
+from tests.conftest import HANGING
 from tests.examples.tiny_datasets import digests, make_tiny
 
 ROOT = Path(__file__).parents[2]
@@ -71,7 +72,7 @@ def test_what_a_killed_process_leaves_is_tidied_up_without_a_word():
     options, pipe = list(sys.warnoptions), subprocess.PIPE
     command = [sys.executable, "-c", KILLED]
     with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
-        said = process.communicate("go on\ndie\n", timeout=60)  # until the helpers are gone, too
+        said = process.communicate("go on\ndie\n", timeout=HANGING)  # until the helpers are gone, too
     assert (process.returncode, *said) == (-signal.SIGKILL, "", "")
     assert not [path for path in Path("/dev/shm").iterdir() if f"loky-{process.pid}-" in path.name]
     assert sys.warnoptions == options
@@ -161,8 +162,8 @@ def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, n
         workers = {int(child.stdout.readline()) for _ in range(2)}
         assert all(map(alive, workers))
         child.send_signal(number)
-        assert child.wait(10) == -number
-        deadline = time.monotonic() + 10
+        assert child.wait(HANGING) == -number
+        deadline = time.monotonic() + HANGING
         while any(map(alive, workers)) and time.monotonic() < deadline:
             time.sleep(0.05)
         assert not any(map(alive, workers))

@@ -5,19 +5,14 @@ import pytest
 
 from cnpgen.planner.control_points import control_points
 from cnpgen.planner.kit import make_kit
-from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.landing import make_landing
 from cnpgen.planner.preparation import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import anchor_line, assemble
-from tests.conftest import columns_of
-from tests.examples.models import boundary_of_columns, surroundings_of
+from tests.conftest import columns_of, needs_compiler
+from tests.examples.models import boundary_of_columns, landing_of, surroundings_of
 from tests.planner.test_parts import heights, worst_tilt
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
-
-
-def landing_of(name: str) -> Landing:
-    given = surroundings_of(name)
-    return make_landing(given.problem, given.kernels, steps=1)
 
 
 def nearby(tiny, name: str, count: int = 8) -> tuple[np.ndarray, np.ndarray]:
@@ -69,6 +64,17 @@ def test_gradients_behind_the_landing_are_taken_back_exactly(tiny, name):
         high, low = (landing.land(path + sign * step, tops) for sign in (1, -1))
         found = ((high - low) * gradient).sum(axis=(1, 2)) / 2e-6
         np.testing.assert_allclose((back * direction).sum(axis=(1, 2)), found, rtol=1e-5, atol=1e-6)
+
+
+@needs_compiler
+@pytest.mark.extended
+def test_the_landing_of_transports_is_the_same_compiled_and_interpreted(tiny):
+    path, tops = nearby(tiny, "heavy-object", 3)
+    given, gradient = surroundings_of("heavy-object"), np.random.default_rng(1).normal(size=path.shape)
+    compiled, interpreted = make_landing(given.problem, given.kernels, steps=1), landing_of("heavy-object")
+    np.testing.assert_allclose(compiled.land(path, tops), interpreted.land(path, tops), rtol=0, atol=1e-12)
+    found, expected = (each.pull_back(path, tops, gradient) for each in (compiled, interpreted))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):

@@ -20,7 +20,7 @@ from cnpgen.trajectory.spline import chebyshev
 from cnpgen.world.state import World
 from tests.conftest import columns_of
 from tests.examples.constraints import TipSpeed
-from tests.examples.models import boundary_of_columns, surroundings_of, untrained_model
+from tests.examples.models import boundary_of_columns, interpreted, surroundings_of, untrained_model
 from tests.examples.plans import KNOTS
 
 LIMITS = ("joint velocity", "joint acceleration", "joint torque")
@@ -40,7 +40,7 @@ def worst_tilt(name: str, path: np.ndarray) -> float:
 
 def bent_paths(tiny, dataset: str, name: str, steps: int, count: int = 12) -> np.ndarray:
     """Paths of the bent line alone."""
-    given = surroundings_of(name)
+    given = interpreted(surroundings_of(name))
     boundary = boundary_of_columns(columns_of(tiny(dataset)), count)
     tasks = make_kit(given, bending_steps=steps, landing_steps=0, slow_down=False).prepare(boundary)
     spec = given.problem.trajectory
@@ -87,7 +87,8 @@ def test_a_problem_without_equalities_keeps_the_straight_line(tiny):
     given = surroundings_of("heavy-object")
     free = [each for each in given.problem.constraint if type(each).__name__ != "Vertical"]
     problem = replace(given.problem, constraint=tuple(free))
-    kernels = replace(given.kernels, identity="free", arguments={"robot": given.robot, "problem": problem})
+    arguments = {"robot": given.robot, "problem": problem}
+    kernels = replace(interpreted(given).kernels, identity="free", arguments=arguments)
     surrounding = replace(given, problem=problem, kernels=kernels)
     kit = make_kit(surrounding, bending_steps=2, landing_steps=1, slow_down=False)
     assert kit.prepare(boundary_of_columns(columns_of(tiny("heavy-object")), 3)).correction is None
@@ -167,7 +168,8 @@ def test_a_torque_that_gravity_alone_exceeds_slows_nothing_down(fast):
     limits = replace(given.problem.limits, torque_scale=0.05)
     problem = replace(given.problem, limits=limits)
     robot = replace(given.robot, torque_limit=given.robot.torque_limit * 0.05 / 0.8)
-    kernels = replace(given.kernels, identity="weak", arguments={"robot": robot, "problem": problem})
+    arguments = {"robot": robot, "problem": problem}
+    kernels = replace(interpreted(given).kernels, identity="weak", arguments=arguments)
     slow = motion.slower(np.full(12, 10.0))
     weak = make_slowing(problem, robot, kernels)
     assert (weak.factor(slow, tops) < SLOWEST).any()

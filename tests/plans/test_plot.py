@@ -14,6 +14,8 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.plans.plot import plot_plan
 from tests.examples.plans import Plan, bent, course, load
 
+again = pytest.mark.extended  # the same claim, with the other of two plans
+
 
 def draw(plan: Plan, path: Path, index: int = 0) -> None:
     plot_plan(plan.problem, plan.robot, plan.motion, index, path)
@@ -33,8 +35,13 @@ def axes_of(figure: Figure) -> dict[str, Any]:
     return {axis.get_title() or axis.get_ylabel(): axis for axis in axes}
 
 
-@pytest.mark.parametrize("label", ["hit", "transport"])
-@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+@pytest.mark.parametrize(
+    ("label", "suffix"),
+    [
+        *(("hit", "png"), ("transport", "pdf"), ("hit", "svg")),
+        *(pytest.param(*each, marks=again) for each in (("transport", "png"), ("hit", "pdf"), ("transport", "svg"))),
+    ],
+)
 def test_a_plan_is_drawn(label, suffix, tmp_path):
     draw(load(label), tmp_path / f"plan.{suffix}")
     assert (tmp_path / f"plan.{suffix}").stat().st_size > 10_000
@@ -100,8 +107,13 @@ def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_
     assert drawn[0].get_suptitle() == f"heavy-object, plan 0: {plan.motion.duration()[0]:.3f} s\nnot valid"
 
 
-@pytest.mark.parametrize("label", ["hit", "transport"])
-@pytest.mark.parametrize("by", [1.0, 1e3, 1e150])
+@pytest.mark.parametrize(
+    ("label", "by"),
+    [
+        *(("hit", 1.0), ("transport", 1e3), ("hit", 1e150)),
+        *(pytest.param(*each, marks=again) for each in (("transport", 1.0), ("hit", 1e3), ("transport", 1e150))),
+    ],
+)
 def test_a_plan_beyond_its_limits_is_drawn_too(label, by, tmp_path):
     draw(bent(load(label), by), tmp_path / "plan.png")
 

@@ -24,8 +24,9 @@ from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Outcome
+from tests.conftest import HANGING
 
-N = 13
+N, HITS = 13, 24
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +37,11 @@ def problems() -> Plans:
 @pytest.fixture(scope="module")
 def solved(problems: Plans) -> Plans:
     return refine_plans(problems, workers=1).plans
+
+
+@pytest.fixture(scope="module")
+def hits() -> Plans:
+    return refine_plans(draw_problems("airhockey-hit", HITS), workers=1).plans
 
 
 def same(one: Plans, other: Plans) -> bool:
@@ -330,20 +336,32 @@ def test_bad_arguments_are_one_line_and_leave_nothing_behind(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_killed_solve_loses_nothing_that_was_finished(number: int, tmp_path: Path) -> None:
+def test_a_killed_solve_loses_nothing_that_was_finished(number: int, hits: Plans, tmp_path: Path) -> None:
     out = tmp_path / "plans.h5"
-    words = [sys.executable, "-m", "cnpgen", "solve", "airhockey-hit", "--n", "40", "-o", str(out), "--workers", "2"]
+    words = [
+        sys.executable,
+        "-m",
+        "cnpgen",
+        "solve",
+        "airhockey-hit",
+        "--n",
+        str(HITS),
+        "-o",
+        str(out),
+        "--workers",
+        "2",
+    ]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"TERM": "dumb"})
-    journal, deadline = out.with_name("plans.h5.part"), time.monotonic() + 120
-    while not (journal.exists() and journal.stat().st_size > 20_000) and time.monotonic() < deadline:
+    journal = out.with_name("plans.h5.part")
+    while not (journal.exists() and journal.stat().st_size > 20_000) and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(number)
-    process.communicate(timeout=60)
+    process.communicate(timeout=HANGING)
     assert not out.exists()
     kept = journal.stat().st_size
     assert kept > 20_000
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "there already" in done.stderr
-    assert same(load_plans(out), refine_plans(draw_problems("airhockey-hit", 40), workers=1).plans)
+    assert same(load_plans(out), hits)
     assert not journal.exists()

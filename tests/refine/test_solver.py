@@ -38,7 +38,8 @@ def transcription(
     plan: Plan, points: int, boundary: Boundary | None = None, criterion: Criterion | None = None
 ) -> Transcription:
     kernels, spec = library(plan.problem.name), plan.problem.trajectory
-    residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
+    interpreted = replace(kernels, backend="numpy")  # for some points that is quicker than compiling
+    residuals = None if criterion is None else interpreted.load(criterion_residuals, kind=criterion.kind)
     stage = ResidualKernels(spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals)
     return Transcription(stage, make_grid(spec, points), boundary=boundary or plan.boundary, tops=tops(plan))
 
