@@ -66,9 +66,7 @@ def test_what_leads_to_no_problem_is_named(tmp_path: Path) -> None:
         as_problem(dataset)
     with pytest.raises(RecipeError, match=r"unknown problem, pipeline or dataset 'airhokey-hit' .did you mean 'airho"):
         as_problem("airhokey-hit")
-    with pytest.raises(
-        RecipeError, match="unknown problem 'airhockey-hit': it is the name of a pipeline and a dataset"
-    ):
+    with pytest.raises(RecipeError, match="'airhockey-hit': it is the name of a pipeline and a dataset"):
         load_problem("airhockey-hit")
 
 

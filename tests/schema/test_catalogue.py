@@ -387,7 +387,7 @@ def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path
         (
             load_dataset_recipe,
             "airhockey",
-            "unknown dataset or pipeline 'airhockey': it is the name of a problem; known: ",
+            "dataset or pipeline 'airhockey': it is the name of a problem; ",
         ),
     ],
 )

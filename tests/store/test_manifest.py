@@ -198,7 +198,9 @@ def test_croissant_says_the_unit_of_every_field(dataset: Path) -> None:
     assert vocabulary == croissant["@context"]["sc"] == "https://schema.org/"
     variables = croissant["variableMeasured"]
     assert {item["@type"] for item in variables} == {"sc:PropertyValue"}
-    assert {item["name"]: item["unitText"] for item in variables} == {field.name: field.unit for field in PLAN.fields}
+    assert {item["name"]: item["unitText"] for item in variables} == {
+        field.name: field.unit for field in BLUEPRINT.fields
+    }
     start, goal, clearance, number = variables
     assert start["description"] == "initial joint positions (j1, j2, j3)"
     assert (start["minValue"], start["maxValue"]) == (-2.0, 2.0)
