@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from cnpgen.losses.metric_settings import suggested_weights
     from cnpgen.losses.plan_loss import PlanLoss
     from cnpgen.losses.quadrature import rotating_shift
+    from cnpgen.make.boundary_problems import draw_boundary_problems
     from cnpgen.make.dataset import make_dataset
     from cnpgen.make.load import load_dataset_recipe
-    from cnpgen.make.problems import draw_problems, load_problems
     from cnpgen.pipelines.load import load_pipeline
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.omega import Omega
     from cnpgen.planner.planner import Planner, states_at
+    from cnpgen.plans.boundary_problems import load_boundary_problems
     from cnpgen.plans.evaluate import Evaluation, evaluate_plans
     from cnpgen.plans.export import export_plans
     from cnpgen.plans.load import load_plans
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from cnpgen.problems.load import load_problem
     from cnpgen.problems.obstacles import obstacle_tops
     from cnpgen.refine.options import RefineOptions
-    from cnpgen.refine.plans import Refinement, refine_plans
+    from cnpgen.refine.plans import Refinement, refine_plans, solve_plans
     from cnpgen.refine.proof.proof import explain_plans
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.store.inspection import inspect_dataset
@@ -63,20 +64,20 @@ _HOME = {
     "TrainingSettings": "training.settings",
     "UsageError": "errors",
     "check_machine": "validate.machine",
-    "draw_problems": "make.problems",
+    "draw_boundary_problems": "make.boundary_problems",
     "evaluate_plans": "plans.evaluate",
     "explain_plans": "refine.proof.proof",
     "export_plans": "plans.export",
     "fit_motion": "trajectory.fit",
     "inspect_dataset": "store.inspection",
     "list_recipes": "schema.catalogue",
+    "load_boundary_problems": "plans.boundary_problems",
     "load_dataset": "loader.load",
     "load_dataset_recipe": "make.load",
     "load_model": "planner.model_file",
     "load_pipeline": "pipelines.load",
     "load_plans": "plans.load",
     "load_problem": "problems.load",
-    "load_problems": "make.problems",
     "make_dataset": "make.dataset",
     "make_plans": "plans.plans",
     "obstacle_tops": "problems.obstacles",
@@ -84,6 +85,7 @@ _HOME = {
     "refine_plans": "refine.plans",
     "rotating_shift": "losses.quadrature",
     "save_plans": "plans.save",
+    "solve_plans": "refine.plans",
     "states_at": "planner.planner",
     "suggested_weights": "losses.metric_settings",
     "train_model": "training.train",
@@ -110,20 +112,20 @@ __all__ = [
     "UsageError",
     "__version__",
     "check_machine",
-    "draw_problems",
+    "draw_boundary_problems",
     "evaluate_plans",
     "explain_plans",
     "export_plans",
     "fit_motion",
     "inspect_dataset",
     "list_recipes",
+    "load_boundary_problems",
     "load_dataset",
     "load_dataset_recipe",
     "load_model",
     "load_pipeline",
     "load_plans",
     "load_problem",
-    "load_problems",
     "make_dataset",
     "make_plans",
     "obstacle_tops",
@@ -131,6 +133,7 @@ __all__ = [
     "refine_plans",
     "rotating_shift",
     "save_plans",
+    "solve_plans",
     "states_at",
     "suggested_weights",
     "train_model",

@@ -20,6 +20,7 @@ from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
+    from cnpgen.store.blueprint import Blueprint
 
 Array = NDArray[np.float64]
 
@@ -113,6 +114,12 @@ def record_problem(problem: Problem) -> ProblemRecord:
     """Write a problem and its URDF down."""
     recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
     return ProblemRecord(recipe, problem.urdf_path.read_bytes().decode())
+
+
+def record_of(blueprint: "Blueprint") -> ProblemRecord:
+    """Return the problem that a dataset was made for, from its blueprint."""
+    recipe = json.dumps(blueprint.recipe["pipeline"]["problem"], ensure_ascii=False)
+    return ProblemRecord(recipe, str(blueprint.robot["urdf"]))
 
 
 @lru_cache(maxsize=8)

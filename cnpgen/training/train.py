@@ -10,7 +10,7 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
-from cnpgen.planner.requests import record_of
+from cnpgen.problems.record import record_of
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.documents import plain
 from cnpgen.training.checkpoint import Checkpoints, differences
