@@ -14,7 +14,6 @@ from typing import Any
 
 from common import arguments, median, progress, report, table, verdict
 
-from cnpgen.cli.describe import kind_name
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
@@ -107,8 +106,9 @@ def measure_rates(cases: list[Case], repeat: int, blocks: dict[str, int]) -> Non
 def measure_stages(case: Case, blocks: int) -> None:
     """Time every stage of some blocks."""
     prepared = case.prepared
-    case.stages = [StageTime(name) for name in [*map(_label, prepared.pipeline.stage), "(last gate)"]]
     stages, accept = prepared._stages, prepared._accept
+    names = [_name(label, stage) for (label, _), stage in zip(stages, prepared.pipeline.stage, strict=True)]
+    case.stages = [StageTime(name) for name in [*names, "(last gate)"]]
     timed = [stage.timed(run) for stage, run in zip(case.stages, [*(run for _, run in stages), accept], strict=True)]
     prepared._stages = [(label, run) for (label, _), run in zip(stages, timed, strict=False)]
     prepared._accept = timed[-1]
@@ -117,9 +117,10 @@ def measure_stages(case: Case, blocks: int) -> None:
     prepared._stages, prepared._accept = stages, accept
 
 
-def _label(stage: Stage) -> str:
+def _name(label: str, stage: Stage) -> str:
+    """Name a stage by its kind, which its label has after its number, and by what tells it from others of the kind."""
     details = [getattr(stage, key, None) for key in ("end", "judge")]
-    return " ".join([kind_name(stage), *(str(detail) for detail in details if detail)])
+    return " ".join([label.partition(". ")[2], *(str(detail) for detail in details if detail)])
 
 
 def rate_table(cases: list[Case]) -> str:

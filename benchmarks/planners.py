@@ -18,7 +18,7 @@ from common import arguments, median, progress, report, table, verdict
 from refiner_problems import grid_of_hits, make_each
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.problems import draw_problems
+from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
@@ -102,7 +102,7 @@ def measure_grid(name: str) -> dict[str, float]:
 def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, Any]]:
     """Plan anew from points on valid plans, to the same goal and to another one."""
     planner = Planner(name)
-    plans = planner.plan_batch(draw_problems(name, planned, seed=seed).boundary)
+    plans = planner.plan_batch(draw_boundary_problems(name, planned, seed=seed).boundary)
     plans, found = plans[evaluate_plans(plans).valid], []
     others = np.roll(np.arange(len(plans)), 1)
     for goal, ends in (("same", plans.boundary), ("another", plans.boundary[others])):
@@ -118,7 +118,7 @@ def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, A
 
 def curve(name: str, seed: int, count: int) -> dict[int, float]:
     """Refine with few steps: mean motion time over that with as many as it takes, where both are valid."""
-    plans = Planner(name).plan_batch(draw_problems(name, count, seed=seed).boundary)
+    plans = Planner(name).plan_batch(draw_boundary_problems(name, count, seed=seed).boundary)
     found = {}
     with one_thread():
         full = make_each(plans, DEFAULT)
@@ -145,7 +145,7 @@ def replan_table(found: list[dict[str, Any]]) -> str:
 def measure(name: str, seed: int, planned: int, refined: int) -> dict[str, float]:
     progress(f"{name}: {planned} plans, {refined} of them refined")
     planner = Planner(name)
-    given = draw_problems(name, max(planned, refined), seed=seed)
+    given = draw_boundary_problems(name, max(planned, refined), seed=seed)
     plans = planner.plan_batch(given.boundary)
     return {**judge(plans[:planned]), **refine(plans[:refined])}
 

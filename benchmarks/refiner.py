@@ -27,7 +27,7 @@ from refiner_problems import Made, grid_of_hits, like_a_networks, make_each
 from slsqp import minimise_slsqp
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.problems import draw_problems
+from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
 from cnpgen.refine.engine import load_refiner, prepare, tasks_of
@@ -79,7 +79,7 @@ def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     facts, rows, failures = {}, [], []
     for name, count in zip(PIPELINES, sizes["fresh"], strict=True):
         progress(f"{count} of {name}")
-        problems = draw_problems(name, count, seed=options.seed)
+        problems = draw_boundary_problems(name, count, seed=options.seed)
         found = make_each(problems, RefineOptions())
         share = float(np.mean([each.valid for each in found]))
         mean = float(np.mean([each.ms for each in found]))
@@ -101,7 +101,7 @@ def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     facts, rows, worse = {}, [], []
     for name in PIPELINES:
         progress(f"{name} with ipopt")
-        problems = draw_problems(name, sizes["ipopt"], seed=options.seed + 1)
+        problems = draw_boundary_problems(name, sizes["ipopt"], seed=options.seed + 1)
         tool = prepare(problems, RefineOptions())
         own, other = (make_each(problems, RefineOptions(), each) for each in (tool, with_ipopt(tool)))
         both = [index for index in range(len(own)) if own[index].valid and other[index].valid]
@@ -137,7 +137,7 @@ def height(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     """Compare the refiner's narrow band around the table's height with the whole tolerance."""
     facts, rows = {}, []
     for name in PIPELINES[:2]:
-        problems = draw_problems(name, sizes["height"], seed=options.seed + 2)
+        problems = draw_boundary_problems(name, sizes["height"], seed=options.seed + 2)
         narrow, wide = make_each(problems, RefineOptions()), make_each(problems, RefineOptions(), wide_band(problems))
         both = [(a, b) for a, b in zip(narrow, wide, strict=True) if a.valid and b.valid]
         lost = np.array([a.duration / b.duration - 1 for a, b in both])
@@ -166,7 +166,7 @@ def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     """Compare with SLSQP, from nothing and from network-like starts."""
     facts, rows = {}, []
     for name in ("airhockey-hit", "heavy-object"):
-        problems = draw_problems(name, sizes["slsqp"], seed=options.seed + 3)
+        problems = draw_boundary_problems(name, sizes["slsqp"], seed=options.seed + 3)
         refiner = prepare(problems, RefineOptions())
         nothing = make_each(problems, RefineOptions())
         starts = like_a_networks(problems, nothing, options.seed)
@@ -188,7 +188,7 @@ def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
 
 def workers(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     """Measure plans per second, with the start of the processes, in turns: the middle one of the ratios counts."""
-    problems = draw_problems("airhockey-hit", sizes["workers"], seed=options.seed + 4)
+    problems = draw_boundary_problems("airhockey-hit", sizes["workers"], seed=options.seed + 4)
     speeds: dict[int, list[float]] = {1: [], 2: []}
     for turn in range(TURNS):
         progress(f"turn {turn + 1} of {TURNS}")

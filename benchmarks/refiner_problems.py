@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make.problems import problems_of_rows
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.stages.stage import Round
+from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem, record_problem
 from cnpgen.refine.engine import prepare, tasks_of
@@ -110,7 +110,7 @@ def grid_of_hits() -> Plans:
     start = {"start_q": still + base, "start_dq": still, "start_ddq": still}
     start["start_xyz"] = np.tile(Arm(context.robot).at(base).position, (draws.size, 1))
     columns |= {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed", "hit_speed_max")}
-    return problems_of_rows(record_problem(context.problem), {**columns, **start})
+    return plans_of_rows(record_problem(context.problem), {**columns, **start})
 
 
 def like_a_networks(plans: Plans, made: list[Made], seed: int) -> Plans:

@@ -26,11 +26,10 @@ from cnpgen.losses.plan_loss import LossValue as LossValue
 from cnpgen.losses.plan_loss import PlanLoss as PlanLoss
 from cnpgen.losses.quadrature import rotating_shift as rotating_shift
 from cnpgen.machine.versions import __version__ as __version__
+from cnpgen.make.boundary_problems import draw_boundary_problems as draw_boundary_problems
 from cnpgen.make.dataset import MadeDataset as MadeDataset
 from cnpgen.make.dataset import make_dataset as make_dataset
 from cnpgen.make.load import load_dataset_recipe as load_dataset_recipe
-from cnpgen.make.problems import draw_problems as draw_problems
-from cnpgen.make.problems import load_problems as load_problems
 from cnpgen.make.recipe import DatasetRecipe as DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline as load_pipeline
 from cnpgen.pipelines.pipeline import Pipeline as Pipeline
@@ -46,6 +45,7 @@ from cnpgen.planner.omega import Omega as Omega
 from cnpgen.planner.planner import Planner as Planner
 from cnpgen.planner.planner import states_at as states_at
 from cnpgen.planner.tasks import Tasks as Tasks
+from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
 from cnpgen.plans.evaluate import Evaluation as Evaluation
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
 from cnpgen.plans.export import Exported as Exported
@@ -64,6 +64,7 @@ from cnpgen.problems.record import ProblemRecord as ProblemRecord
 from cnpgen.refine.options import RefineOptions as RefineOptions
 from cnpgen.refine.plans import Refinement as Refinement
 from cnpgen.refine.plans import refine_plans as refine_plans
+from cnpgen.refine.plans import solve_plans as solve_plans
 from cnpgen.refine.proof.proof import Explanation as Explanation
 from cnpgen.refine.proof.proof import Feasibility as Feasibility
 from cnpgen.refine.proof.proof import explain_plans as explain_plans

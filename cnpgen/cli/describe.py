@@ -12,7 +12,6 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.robot import load_robot
-from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, Range, keys
 
@@ -39,7 +38,7 @@ def describe(recipe: Recipe) -> str:
         return f"{describe_dataset(recipe)}\n\n{describe(recipe.pipeline)}"
     if isinstance(recipe, Pipeline):
         return f"{describe_pipeline(recipe)}\n\n{describe(recipe.problem)}"
-    return describe_problem(recipe, load_robot(recipe))
+    return describe_problem(recipe)
 
 
 def describe_dataset(recipe: DatasetRecipe) -> str:
@@ -64,10 +63,14 @@ def describe_pipeline(pipeline: Pipeline) -> str:
     return "\n".join([f"pipeline {pipeline.name}", *_title(pipeline.title), *table(steps, indent="  ")])
 
 
-def describe_problem(problem: Problem, robot: Robot) -> str:
-    """Describe a problem: its robot, limits and constraints."""
+def describe_problem(problem: Problem) -> str:
+    """Describe a problem: its robot, limits and constraints.
+
+    Raises:
+        RecipeError: The robot's URDF does not fit the problem.
+    """
     spec = problem.robot
-    facts = [("robot", f"{spec.urdf}, {robot.n} planned joints, tip {spec.tip!r}")]
+    facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
     facts += [("object", numbers(problem.object))] if problem.object else []
     facts += [("obstacle", f"{box.name}: {numbers(box, leave_out=('name',))}") for box in problem.obstacle]
     facts += [("motion", numbers(problem.trajectory))]
@@ -81,7 +84,7 @@ def describe_problem(problem: Problem, robot: Robot) -> str:
             *table(facts, indent="  "),
             "",
             "  planning limits",
-            *table(_limit_rows(robot), indent="    "),
+            *table(_limit_rows(problem), indent="    "),
             "",
             "  constraints",
             *table(constraints or [("none", "")], indent="    "),
@@ -89,7 +92,8 @@ def describe_problem(problem: Problem, robot: Robot) -> str:
     )
 
 
-def _limit_rows(robot: Robot) -> list[tuple[str, ...]]:
+def _limit_rows(problem: Problem) -> list[tuple[str, ...]]:
+    robot = load_robot(problem)
     head = ("joint", "position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]", "torque [N m]", "base [rad]")
     columns = (robot.velocity_limit, robot.acceleration_limit, robot.torque_limit, robot.base)
     ranges = zip(robot.position_lower, robot.position_upper, strict=True)

@@ -93,8 +93,8 @@ def _write_json(file: Path, found: "Evaluation") -> None:
 
 
 def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
+    from cnpgen.judges.plans.plot import plot_plan
     from cnpgen.plans import open_problem
-    from cnpgen.plans.plot import plot_plan
     from cnpgen.problems.obstacles import obstacle_tops
 
     plans, chosen = found.plans, _chosen(found) if index is None else index

@@ -54,7 +54,9 @@ def check_there(what: str) -> None:
     hint = nearest(what, [*names, *_neighbours(Path(what))])
     if what.endswith(".toml"):
         raise UsageError(f"no such file: {what}{hint}")
-    raise UsageError(f"{what} is neither a folder nor a dataset or pipeline{hint}: 'cnpgen list' names those that ship")
+    raise UsageError(
+        f"{what} is neither a folder nor a file, dataset or pipeline{hint}: 'cnpgen list' names those that ship"
+    )
 
 
 def _shipped(*kinds: str) -> set[str]:

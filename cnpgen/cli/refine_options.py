@@ -13,6 +13,8 @@ from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from cnpgen.plans import Plans
     from cnpgen.refine.plans import Refinement
 
@@ -63,7 +65,14 @@ def add_refining(parser: argparse._ActionsContainer) -> None:
     option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")
 
 
-def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *, title: str) -> int:
+def refine_and_save(
+    arguments: argparse.Namespace,
+    plans: "Plans",
+    out: Path,
+    *,
+    title: str,
+    make: "Callable[..., Refinement] | None" = None,
+) -> int:
     """Refine plans, save them, say what came of them; return the exit code.
 
     Args:
@@ -71,6 +80,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
         plans: The plans.
         out: Where they go.
         title: What is going on.
+        make: ``refine_plans`` by default, or ``solve_plans``.
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
@@ -89,7 +99,7 @@ def refine_and_save(arguments: argparse.Namespace, plans: "Plans", out: Path, *,
         meter.note(f"{finished[1] / finished[0]:.1%} valid")
 
     try:
-        found = refine_plans(
+        found = (make or refine_plans)(
             plans,
             options=options,
             workers=arguments.workers,

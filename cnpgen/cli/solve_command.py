@@ -1,6 +1,8 @@
-"""``cnpgen solve``: make plans for the problems of a dataset, or for fresh draws of a recipe, from nothing."""
+"""``cnpgen solve``: make plans for boundary problems of a dataset, of a file, or fresh draws, from nothing."""
 
 import argparse
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,9 @@ if TYPE_CHECKING:
 _TEXT = (
     """\
 A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds. Rows of a
-certified dataset have plans already: these are refined.
+certified dataset have plans already: these are refined. An HDF5 file gives boundary conditions: a shard, a file of
+plans, whose plans are not looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
+start_ddq and goal_dq where they are not zero. --problem says which problem it is of where the file does not.
 """
     + TEXT
 )
@@ -25,21 +29,31 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "solve", run, title="make plans from nothing", text=_TEXT)
     option = parser.add_argument
     option(
-        "what", metavar="DIR|NAME|FILE", help="a dataset's folder; or a dataset or pipeline by name, or a recipe file"
+        "what",
+        metavar="DIR|NAME|FILE",
+        help="a dataset's folder; a dataset or pipeline by name, or a recipe file; or boundary conditions in HDF5",
     )
     option("--n", metavar="K", type=values.rows, help="how many problems; of a folder by default all of the split")
     option("--split", metavar="NAME", help="which split of the folder (default: validation)")
     option("--first", metavar="I", type=values.natural, help="the first row of the split (default: 0)")
     option("--seed", metavar="S", type=values.seed, help="root seed of fresh draws; default the recipe's")
+    option(
+        "--problem",
+        metavar="NAME|FILE",
+        help="the problem that boundary conditions in HDF5 must be of; its tolerances count",
+    )
     option("-o", "--out", metavar="OUT", type=Path, help="where to (default: DIR-plans.h5 or NAME-plans.h5 here)")
     add_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    plans = _problems(arguments)
+    from cnpgen.refine.plans import refine_plans, solve_plans
+
+    problems = _problems(arguments)
     out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
-    return refine_and_save(arguments, plans, out, title=f"solving {arguments.what}")
+    make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans  # rows of certified datasets have plans
+    return refine_and_save(arguments, problems, out, title=f"solving {arguments.what}", make=make)
 
 
 def _name(what: Path) -> str:
@@ -48,22 +62,57 @@ def _name(what: Path) -> str:
 
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
+    """Read or draw the boundary problems, by what it is that was given."""
+    from cnpgen.store.paths import file_kind
+
+    what = Path(arguments.what)
+    kind = file_kind(what)
+    if what.is_dir():
+        return _rows(arguments)
+    if what.is_file() and (kind or what.suffix == ".h5") and not kind.endswith(" of cnpgen"):
+        return _conditions(arguments)
+    return _draws(arguments)
+
+
+def _rows(arguments: argparse.Namespace) -> "Plans":
+    from cnpgen.plans.boundary_problems import load_boundary_problems
+
+    _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
+    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset says its problem itself")
+    split = arguments.split or "validation"
+    return load_boundary_problems(arguments.what, split=split, start=arguments.first, n=arguments.n)
+
+
+def _conditions(arguments: argparse.Namespace) -> "Plans":
+    from cnpgen.errors import DatasetError
+    from cnpgen.plans.boundary_problems import load_boundary_problems
+
+    _refuse(arguments, ["split", "first", "n"], "--split, --first and --n are for the folder of a dataset, got a file")
+    _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
+    problems = load_boundary_problems(arguments.what, problem=arguments.problem)
+    if not len(problems):
+        raise DatasetError(f"no boundary conditions in {arguments.what}")
+    return problems
+
+
+def _draws(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.errors import UsageError
-    from cnpgen.make.problems import draw_problems, load_problems
+    from cnpgen.make.boundary_problems import draw_boundary_problems
 
-    if Path(arguments.what).is_dir():
-        if arguments.seed is not None:
-            raise UsageError(
-                "--seed is for fresh draws of a recipe; rows of a folder are chosen by --split and --first"
-            )
-        return load_problems(
-            arguments.what, split=arguments.split or "validation", start=arguments.first or 0, n=arguments.n
-        )
     check_there(arguments.what)
     check_recipe(arguments.what)
-    if arguments.split is not None or arguments.first is not None:
-        raise UsageError("--split and --first are for the folder of a dataset; fresh draws of a recipe have --seed")
+    of_rows = "--split and --first are for the folder of a dataset; fresh draws of a recipe have --seed"
+    _refuse(arguments, ["split", "first"], of_rows)
+    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe says its problem itself")
     if arguments.n is None:
         raise UsageError(f"--n says how many fresh problems of the recipe {arguments.what} are drawn: it is missing")
-    return draw_problems(arguments.what, arguments.n, seed=arguments.seed)
+    return draw_boundary_problems(arguments.what, arguments.n, seed=arguments.seed)
+
+
+def _refuse(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:
+    """Refuse options that mean nothing here."""
+    from cnpgen.errors import UsageError
+
+    if any(getattr(arguments, name) is not None for name in options):
+        raise UsageError(why)

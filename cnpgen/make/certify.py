@@ -1,7 +1,7 @@
 """Stage: certified samples, each with a plan that Pinocchio and Coal call valid."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,12 +12,6 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.store.field import Field
-from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spec import TrajectorySpec
-
-if TYPE_CHECKING:
-    from cnpgen.refine.task import Refined
 
 NO_PLAN = "no plan found"
 
@@ -67,23 +61,13 @@ class CertifiedPlan(Stage):
         def run(batch: Round, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in batch.columns.items()}
             with one_thread():
-                found = solve(Boundary.from_batch(columns, None), columns["start_xyz"], columns["goal_xyz"])
-            _write(batch, found, context.problem.trajectory, context.robot.n)
+                motion, valid = solve(columns)
+            batch["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)
+            batch["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
+            batch["duration"] = motion.duration()[None]
+            batch.reject(valid, NO_PLAN)
 
         return run
-
-
-def _write(batch: Round, found: "list[Refined]", spec: TrajectorySpec, n: int) -> None:
-    """Write the plans' columns and reject the samples without a valid one."""
-    motion = Motion(
-        np.array([each.path for each in found]).reshape(len(found), spec.path_control_points, n),
-        np.array([each.rate for each in found]).reshape(len(found), spec.rate_control_points),
-        spec.degree,
-    )
-    batch["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(found), -1).T)
-    batch["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
-    batch["duration"] = motion.duration()[None]
-    batch.reject(np.array([each.valid for each in found], bool), NO_PLAN)
 
 
 def certified(recipe: DatasetRecipe) -> DatasetRecipe:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.boundary_arguments import boundary_of
 from cnpgen.trajectory.moment import states_at_times
 
 Array = NDArray[np.float64]

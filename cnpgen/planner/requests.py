@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, UsageError, lacks
-from cnpgen.planner.boundary_arguments import boundary_of
+from cnpgen.errors import DatasetError
 from cnpgen.planner.model import Model
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.boundary_file import ASKED, CONTEXT, boundary_in
+from cnpgen.plans.boundary_problems import chosen_rows
 from cnpgen.problems.record import ProblemRecord, as_record
 from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.files.documents import canonical_sha256
@@ -21,8 +21,6 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 CERTIFIED = "certified-plan"  # the stage that plans every sample
-CONTEXT = ("hit_angle", "hit_speed")  # columns of a dataset that plans keep
-ASKED = (*BOUNDARY, "goal_ddq", "sample_id", *CONTEXT)
 
 
 @dataclass(frozen=True)
@@ -59,34 +57,24 @@ def read_rows(
     """
     dataset = open_dataset(folder)
     check_drawing(str(folder), dataset.blueprint, model, other=other)
-    if split not in dataset.blueprint.splits:
-        raise UsageError(f"{folder} {lacks('split', split, dataset.blueprint.splits)}")
-    rows = dataset.blueprint.splits[split]
-    stop = rows if n is None else first + n
-    if not 0 <= first < stop <= rows:
-        wanted = f"{max(stop - first, 1)} from row {first} on"
-        raise UsageError(f"split {split!r} of {folder} has rows 0 to {rows - 1}, got {wanted}")
+    rows = chosen_rows(folder, dataset.blueprint, split=split, start=first, n=n)
     known = {each.name for each in dataset.blueprint.fields}
     names = [name for name in ASKED if name in known]
-    found = dataset.read(split, fields=names, start=first, stop=stop)
+    found = dataset.read(split, fields=names, start=rows.start, stop=rows.stop)
     columns = {name: np.asarray(found[name], np.float64) for name in CONTEXT if name in found}
-    boundary = boundary_in(str(folder), found, model)
-    return Requests(boundary, found.get("sample_id", np.arange(first, stop)), columns)
+    boundary = checked_boundary(str(folder), found, model)
+    return Requests(boundary, found.get("sample_id", np.array(rows)), columns)
 
 
-def boundary_in(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
-    """Take the boundary conditions out of named columns; what is missing is zero.
+def checked_boundary(where: str, found: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
+    """Take the boundary conditions that a model can plan for out of named columns; what is missing is zero.
 
     Raises:
         DatasetError: A shape is wrong, something is not finite, or goal accelerations are prescribed.
     """
     if "goal_ddq" in found:
         raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
-    try:
-        given = (found.get(name) for name in BOUNDARY)
-        return boundary_of(len(model.problem.joint_names), *given)  # type: ignore[arg-type]
-    except UsageError as error:
-        raise DatasetError(f"{where}: {error}") from error
+    return boundary_in(where, found, len(model.problem.joint_names))
 
 
 def check_problem(where: str, found: ProblemRecord, model: Model) -> None:

@@ -49,7 +49,7 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
         attributes = {name: file.attrs[name] for name in (*ATTRIBUTES, *NOTES) if name in file.attrs}
         _check_format(path, attributes)
         columns = _columns(path, file)
-    record = _record(path, attributes, wanted)
+    record = agreed_problem(path, stored_problem(path, attributes), wanted, content="plans", command="evaluate")
     try:
         plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
@@ -114,16 +114,29 @@ def _number(path: Path, attributes: Mapping[str, Any], name: str, default: int) 
     return int(value)
 
 
-def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | None) -> ProblemRecord:
-    """Find out which problem the plans are for."""
-    found = stored_problem(path, attributes) or wanted
+def agreed_problem(
+    path: Path, stored: ProblemRecord | None, wanted: ProblemRecord | None, *, content: str, command: str
+) -> ProblemRecord:
+    """Return the problem that a file is of: the one that is wanted, if the file is of no other, or the file's own.
+
+    Args:
+        path: The file.
+        stored: The problem that it says it is of, None if it says none.
+        wanted: The problem that it must be of, None for any.
+        content: What the file holds, for messages: "plans".
+        command: The command that has the option ``--problem``, for messages.
+
+    Raises:
+        DatasetError: It is of another problem, or there is neither.
+    """
+    found = stored or wanted
     if found is None:
-        help_ = "set its attribute 'problem' to a name or a file, or pass problem= ('cnpgen evaluate' takes it)"
+        help_ = f"set its attribute 'problem' to a name or a file, or pass problem=... (--problem of {command!r})"
         raise DatasetError(f"{path} does not say its problem: {help_}")
     if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
         where = ", ".join(found.differences(wanted)[:4])
         raise DatasetError(
-            f"{path} has plans of problem {found.name!r}, not of {wanted.name!r}: they differ in {where}"
+            f"{path} has {content} of problem {found.name!r}, not of {wanted.name!r}: they differ in {where}"
         )
     return wanted or found
 

@@ -1,6 +1,6 @@
 """Building the refiner of a problem with all that it needs, and refining plans with it in one process."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
@@ -21,6 +21,7 @@ from cnpgen.refine.solver.criterion import choose_criterion
 from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.task import Refined, Task
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -62,8 +63,8 @@ def tasks_of(plans: Plans) -> list[Task]:
 
 def load_solver(
     problem: "Problem", robot: "Robot", kernels: KernelLibrary
-) -> Callable[[Boundary, Array, Array], list[Refined]]:
-    """Load what makes plans from nothing with the problem's own objective, in one thread.
+) -> Callable[[Mapping[str, Array]], tuple[Motion, NDArray[np.bool_]]]:
+    """Load what makes plans for rows of a dataset from nothing, with the problem's own objective, in one thread.
 
     Args:
         problem: The problem.
@@ -71,14 +72,18 @@ def load_solver(
         kernels: Where kernels are loaded from.
 
     Returns:
-        A function of the boundary conditions of N motions and of the tip positions at their starts and goals [m],
-        shape (N, 3) each.
+        A function of the columns of N rows, shape (N, width) each, that returns N motions and which of them the
+        verdict calls valid, shape (N,).
     """
     refiner = load_refiner(problem, robot, kernels=kernels)
-    jury = Jury(problem, robot, degree=refiner.spec.degree)
+    jury, spec = Jury(problem, robot, degree=refiner.spec.degree), refiner.spec
 
-    def solve(boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[Refined]:
-        return [refine_task(refiner, jury, task) for task in _tasks(problem, boundary, start_xyz, goal_xyz)]
+    def solve(columns: Mapping[str, Array]) -> tuple[Motion, NDArray[np.bool_]]:
+        tasks = _tasks(problem, Boundary.from_batch(columns, None), columns["start_xyz"], columns["goal_xyz"])
+        found = [refine_task(refiner, jury, task) for task in tasks]
+        path = np.array([each.path for each in found]).reshape(len(found), spec.path_control_points, robot.n)
+        rate = np.array([each.rate for each in found]).reshape(len(found), spec.rate_control_points)
+        return Motion(path, rate, spec.degree), np.array([each.valid for each in found], bool)
 
     return solve
 

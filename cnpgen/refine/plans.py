@@ -79,6 +79,49 @@ class Refinement:
         }
 
 
+def solve_plans(
+    problems: Plans,
+    *,
+    options: RefineOptions = DEFAULT,
+    workers: int | None = None,
+    journal: str | Path | None = None,
+    discard: bool = False,
+    begin: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+) -> Refinement:
+    """Make plans for boundary problems from nothing; plans that they have already are not looked at.
+
+    Args:
+        problems: The boundary problems, as ``draw_boundary_problems`` and ``load_boundary_problems`` return them.
+        options: As of ``refine_plans``, like all that follow.
+        workers: Processes.
+        journal: Where finished plans are written down.
+        discard: Whether what another run has written there may be thrown away.
+        begin: Called once.
+        progress: Called now and then.
+
+    Raises:
+        UsageError: As ``refine_plans`` does.
+        RecipeError: Likewise.
+        MachineError: Likewise.
+    """
+    check_plans_type(problems)
+    unmade = replace(
+        problems,
+        path_control_points=np.full_like(problems.path_control_points, np.nan),
+        rate_control_points=np.full_like(problems.rate_control_points, np.nan),
+    )
+    return refine_plans(
+        unmade,
+        options=options,
+        workers=workers,
+        journal=journal,
+        discard=discard,
+        begin=begin,
+        progress=progress,
+    )
+
+
 def refine_plans(
     plans: Plans,
     *,

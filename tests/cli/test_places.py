@@ -81,17 +81,19 @@ def test_a_folder_is_not_a_model(said: Said, tmp_path: Path) -> None:
     assert said(MODELS["plan"], "model.h5") == (2, "model.h5 is a folder, expected a model")
 
 
-@pytest.mark.parametrize("words", [("show", "{}"), ("make-dataset", "{}"), ("solve", "{}", "--n", "1")])
-def test_a_file_of_plans_or_a_model_is_not_a_recipe(
-    said: Said, words: tuple[str, ...], tmp_path: Path, hit: Path
-) -> None:
+@pytest.mark.parametrize("words", [("show", "{}"), ("make-dataset", "{}")])
+def test_a_file_of_plans_is_not_a_recipe(said: Said, words: tuple[str, ...], tmp_path: Path, hit: Path) -> None:
     shutil.copy(hit, tmp_path / "planned.h5")
     line = "planned.h5 is an HDF5 file, a file of plans, expected a recipe: 'cnpgen evaluate planned.h5' judges them"
     assert said(words, "planned.h5") == (2, line)
-    shutil.copy(shipped_models()["airhockey-hit"], tmp_path / "model.h5")
-    assert said(words, "model.h5")[1].startswith("model.h5 is an HDF5 file, a model of cnpgen, expected a recipe")
     h5py.File(tmp_path / "other.h5", "w").close()
     assert said(words, "other.h5")[1].startswith("other.h5 is an HDF5 file, expected a recipe: 'cnpgen inspect'")
+
+
+@pytest.mark.parametrize("words", [("show", "{}"), ("make-dataset", "{}"), ("solve", "{}", "--n", "1")])
+def test_a_model_is_not_a_recipe(said: Said, words: tuple[str, ...], tmp_path: Path) -> None:
+    shutil.copy(shipped_models()["airhockey-hit"], tmp_path / "model.h5")
+    assert said(words, "model.h5")[1].startswith("model.h5 is an HDF5 file, a model of cnpgen, expected a recipe")
 
 
 @pytest.mark.parametrize(("words", "hint"), [(("show", "{}"), "inspect hits"), (("make-dataset", "{}"), "--out hits")])
@@ -116,11 +118,14 @@ def test_a_folder_that_is_called_like_a_recipe_does_not_hide_it(
 @pytest.mark.parametrize(
     ("what", "line"),
     [
-        ("hist", "hist is neither a folder nor a dataset or pipeline (did you mean 'hits'?): 'cnpgen list' names"),
-        ("./hist", "./hist is neither a folder nor a dataset or pipeline (did you mean 'hits'?)"),
+        (
+            "hist",
+            "hist is neither a folder nor a file, dataset or pipeline (did you mean 'hits'?): 'cnpgen list' names",
+        ),
+        ("./hist", "./hist is neither a folder nor a file, dataset or pipeline (did you mean 'hits'?)"),
         (
             "airhockey-hot",
-            "airhockey-hot is neither a folder nor a dataset or pipeline (did you mean 'airhockey-hit'?)",
+            "airhockey-hot is neither a folder nor a file, dataset or pipeline (did you mean 'airhockey-hit'?)",
         ),
         ("hits.tmol/mine.toml", "no such file: hits.tmol/mine.toml"),
         ("airhockey-hit", "--n says how many fresh problems of the recipe airhockey-hit are drawn: it is missing"),

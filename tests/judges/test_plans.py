@@ -318,7 +318,7 @@ def test_a_constraint_without_tolerance_and_with_one_number_is_judged(value, sev
 def test_the_verdict_shares_no_code_with_the_refiner():
     script = """
 import sys
-import cnpgen.plans.plot, cnpgen.judges.plans, cnpgen.world.path
+import cnpgen.judges.plans.plot, cnpgen.judges.plans, cnpgen.world.path
 banned = ("cnpgen.kernels", "cnpgen.refine", "cnpgen.symbolic.state", "cnpgen.symbolic.linalg", "cnpgen.symbolic.boxes")
 heavy = ("casadi", "pinocchio", "coal", "matplotlib", "scipy", "h5py")
 found = [name for name in sys.modules if name.startswith(banned) or name in heavy]

@@ -16,8 +16,8 @@ from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
-from cnpgen.make.problems import load_problems, problems_of_rows
 from cnpgen.plans import load_plans, save_plans
+from cnpgen.plans.boundary_problems import load_boundary_problems, plans_of_rows
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
@@ -55,12 +55,12 @@ def test_the_plans_are_those_that_solve_finds(folder: Path) -> None:
     problem = load_dataset_recipe("airhockey-hit").pipeline.problem
     rows = open_dataset(folder).read("validation")
     unsolved = {name: values for name, values in rows.items() if not name.endswith("control_points")}
-    found = refine_plans(problems_of_rows(record_problem(problem), unsolved)).plans
+    found = refine_plans(plans_of_rows(record_problem(problem), unsolved)).plans
     np.testing.assert_array_equal(found.path_control_points.reshape(len(found), -1), rows["path_control_points"])
 
 
 def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(folder: Path, tmp_path: Path) -> None:
-    plans = load_problems(folder)
+    plans = load_boundary_problems(folder)
     assert evaluate_plans(plans, workers=1).valid.all()
     np.testing.assert_allclose(plans.duration, open_dataset(folder).read("train")["duration"], rtol=1e-12)
     found = refine_plans(plans, workers=1)

@@ -11,7 +11,7 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import MachineError
-from cnpgen.make.problems import draw_problems
+from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.plans import refine_plans
@@ -24,7 +24,7 @@ linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /
 
 @pytest.fixture(scope="module")
 def problems() -> Plans:
-    return draw_problems("airhockey-hit", N, seed=6)
+    return draw_boundary_problems("airhockey-hit", N, seed=6)
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,15 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
+from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.problems import draw_problems, load_problems
 from cnpgen.plans import PlanStatus, load_plans, save_plans
+from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.plans import refine_plans, solve_plans
 from cnpgen.refine.task import Outcome
 from tests.conftest import HANGING
 
@@ -31,7 +32,7 @@ N, HITS = 13, 24
 
 @pytest.fixture(scope="module")
 def problems() -> Plans:
-    return draw_problems("airhockey-replan", N, seed=5)
+    return draw_boundary_problems("airhockey-replan", N, seed=5)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def solved(problems: Plans) -> Plans:
 
 @pytest.fixture(scope="module")
 def hits() -> Plans:
-    return refine_plans(draw_problems("airhockey-hit", HITS), workers=1).plans
+    return refine_plans(draw_boundary_problems("airhockey-hit", HITS), workers=1).plans
 
 
 def same(one: Plans, other: Plans) -> bool:
@@ -53,6 +54,14 @@ def same(one: Plans, other: Plans) -> bool:
 def test_what_is_solved_is_valid_by_evaluate_and_says_so(solved: Plans) -> None:
     assert (solved.status == PlanStatus.VALID).all()
     assert evaluate_plans(solved).valid.all()
+
+
+def test_solving_begins_from_nothing_whatever_plans_there_are(problems: Plans, solved: Plans) -> None:
+    slow = replace(solved, rate_control_points=0.5 * solved.rate_control_points)
+    assert same(solve_plans(slow, workers=1).plans, solved)
+    assert not same(refine_plans(slow, workers=1).plans, solved)
+    with pytest.raises(UsageError, match="expected Plans"):
+        solve_plans("airhockey-hit")  # type: ignore[arg-type]
 
 
 def test_a_refinement_is_printed_as_one_line(problems: Plans) -> None:
@@ -121,7 +130,7 @@ def test_boundary_conditions_that_break_a_limit_by_themselves_get_the_least_viol
 
 
 def test_two_threads_refine_as_one_does() -> None:
-    transports = [draw_problems("heavy-object", 2, seed=seed) for seed in (3, 4)]
+    transports = [draw_boundary_problems("heavy-object", 2, seed=seed) for seed in (3, 4)]
     alone = [refine_plans(each, workers=1).plans for each in transports]
     with ThreadPoolExecutor(2) as pool:
         for _ in range(2):
@@ -167,7 +176,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
 
 def test_without_iterations_a_plan_is_only_repaired(solved: Plans) -> None:
     assert refine_plans(solved, options=RefineOptions(max_iterations=0)).valid.all()
-    task = draw_problems("heavy-object", 1)
+    task = draw_boundary_problems("heavy-object", 1)
     plan = refine_plans(task).plans
     for factor in (1.05, 2.0):
         fast = replace(plan, rate_control_points=factor * plan.rate_control_points)
@@ -192,7 +201,7 @@ def test_a_plan_whose_objective_still_fell_when_the_steps_were_used_up_says_so(p
 
 
 def test_a_valid_plan_whose_rate_has_a_negative_control_point_is_no_worse_afterwards(tmp_path: Path) -> None:
-    plan = refine_plans(draw_problems("heavy-object", 1, seed=5)).plans
+    plan = refine_plans(draw_boundary_problems("heavy-object", 1, seed=5)).plans
     rate = 0.6 * plan.rate_control_points
     rate[0, 4] = -0.005
     given = replace(plan, rate_control_points=rate)
@@ -215,25 +224,25 @@ def test_another_objective_gets_what_it_asks_for(problems: Plans, solved: Plans,
 
 
 def test_drawn_problems_are_those_of_the_seed_and_of_no_other_split(tmp_path: Path) -> None:
-    some, more = draw_problems("airhockey-hit", 5, seed=3), draw_problems("airhockey-hit", 9, seed=3)
+    some, more = draw_boundary_problems("airhockey-hit", 5, seed=3), draw_boundary_problems("airhockey-hit", 9, seed=3)
     np.testing.assert_array_equal(more.boundary.start_q[:5], some.boundary.start_q)
     made = make_dataset("airhockey-hit", tmp_path / "hits", n=40, seed=3, workers=1)
-    train = load_problems(made.folder, split="train")
+    train = load_boundary_problems(made.folder, split="train")
     assert not np.isin(some.boundary.start_q[:, 0], train.boundary.start_q[:, 0]).any()
-    rows = load_problems(made.folder, split="validation", start=1, n=2)
+    rows = load_boundary_problems(made.folder, split="validation", start=1, n=2)
     assert rows.sample_id.tolist() == [1, 2]
     with pytest.raises(UsageError, match=r"no split 'trian' \(did you mean 'train'\?\), only train"):
-        load_problems(made.folder, split="trian")
+        load_boundary_problems(made.folder, split="trian")
     with pytest.raises(UsageError, match=r"has \d+ rows, got 1000 from row 0 on"):
-        load_problems(made.folder, split="validation", n=1000)
+        load_boundary_problems(made.folder, split="validation", n=1000)
     with pytest.raises(UsageError, match="n must be an integer from 1 on, got 0"):
-        draw_problems("airhockey-hit", 0)
+        draw_boundary_problems("airhockey-hit", 0)
     with pytest.raises(UsageError, match=r"n must be an integer from 1 on, got 2\.5"):
-        draw_problems("airhockey-replan", 2.5)  # type: ignore[arg-type]
+        draw_boundary_problems("airhockey-replan", 2.5)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="seed must be an integer from 0 to"):
-        draw_problems("airhockey-replan", 1, seed=-1)
+        draw_boundary_problems("airhockey-replan", 1, seed=-1)
     with pytest.raises(UsageError, match=r"start must be an integer from 0 on, got 1\.0"):
-        load_problems(made.folder, start=1.0)  # type: ignore[arg-type]
+        load_boundary_problems(made.folder, start=1.0)  # type: ignore[arg-type]
 
 
 def test_plans_of_a_folder_are_called_after_it(
@@ -252,7 +261,7 @@ def test_ctrl_c_while_problems_are_explained_loses_nothing(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    problem, out = draw_problems("airhockey-hit", 1), tmp_path / "out.h5"
+    problem, out = draw_boundary_problems("airhockey-hit", 1), tmp_path / "out.h5"
     fast = replace(problem.boundary, goal_dq=30.0 * problem.boundary.goal_dq)
     save_plans(tmp_path / "hard.h5", replace(problem, boundary=fast))
     command = ["refine", str(tmp_path / "hard.h5"), "-o", str(out), "--explain"]

@@ -11,7 +11,7 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.make.problems import draw_problems
+from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.plans import refine_plans
@@ -35,7 +35,7 @@ def explain(plan: Plan, **changes: np.ndarray) -> Explanation:
 
 @cache
 def solved(name: str, count: int) -> Plans:
-    plans = refine_plans(draw_problems(name, count, seed=8), workers=1)
+    plans = refine_plans(draw_boundary_problems(name, count, seed=8), workers=1)
     return plans.plans[np.flatnonzero(plans.valid)]
 
 

@@ -19,6 +19,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     start_ddq: ArrayLike | None,
     goal_q: ArrayLike,
     goal_dq: ArrayLike | None,
+    goal_ddq: ArrayLike | None = None,
 ) -> Boundary:
     """Check boundary conditions and bring them to shape (N, n).
 
@@ -29,6 +30,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         start_ddq: Likewise, or None for zero.
         goal_q: Likewise.
         goal_dq: Likewise, or None for zero.
+        goal_ddq: Likewise, or None where goal accelerations are free.
 
     Raises:
         UsageError: A shape is wrong, or something is not finite.
@@ -39,14 +41,17 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         "start_ddq": start_ddq,
         "goal_q": goal_q,
         "goal_dq": goal_dq,
+        "goal_ddq": goal_ddq,
     }
     arrays = {name: _rows(name, values, n) for name, values in given.items() if values is not None}
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
             raise UsageError(f"{name} has {len(values)} rows, another boundary condition has {rows}")
+    if goal_ddq is None:
+        del given["goal_ddq"]
     zero = np.zeros((1, n))
-    return Boundary(*(_repeated(arrays.get(name, zero), rows) for name in given))
+    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in given})
 
 
 def _rows(name: str, values: ArrayLike, n: int) -> Array:

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.plans.plot import plot_plan
+from cnpgen.judges.plans.plot import plot_plan
 from tests.examples.plans import Plan, bent, course, load
 
 again = pytest.mark.extended  # the same claim, with the other of two plans

@@ -1,4 +1,4 @@
-"""Pictures of one plan: joints against their limits over time, the tip over the table or between the pedestals."""
+"""Pictures of one plan as the judge sees it: joints against limits over time, the tip over the table or in between."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast

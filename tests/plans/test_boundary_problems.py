@@ -1,0 +1,163 @@
+"""Boundary problems to solve: rows of datasets and boundary conditions in HDF5, refused by what is wrong there."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.cli.main import main
+from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
+from cnpgen.plans import PlanStatus, load_plans, save_plans
+from cnpgen.plans.boundary_problems import load_boundary_problems
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.record import record_problem
+from cnpgen.refine.plans import solve_plans
+
+Tiny = Callable[[str], Path]
+RECORD = record_problem(load_problem("airhockey"))
+CONDITIONS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+
+
+@pytest.fixture(scope="module")
+def rows(tiny: Tiny) -> Any:
+    return load_boundary_problems(tiny("airhockey-replan"), n=3)
+
+
+@pytest.fixture
+def write(tmp_path: Path, rows: Any) -> Callable[..., Path]:
+    """Write the rows' boundary conditions, some of them changed or left out, with attributes, as anybody would."""
+
+    def call(name: str = "tasks.h5", attributes: dict[str, Any] | None = None, **changed: Any) -> Path:
+        columns = {key: getattr(rows.boundary, key) for key in CONDITIONS} | changed
+        with h5py.File(tmp_path / name, "w") as file:
+            file.attrs.update(attributes or {})
+            for key, values in columns.items():
+                if values is not None:
+                    file[key] = values
+        return tmp_path / name
+
+    return call
+
+
+def test_a_file_of_boundary_conditions_is_what_its_numbers_say(rows, write) -> None:
+    found = load_boundary_problems(write(sample_id=np.array([7, 3, 5]), hit_angle=np.zeros(3)), problem="airhockey")
+    for name in CONDITIONS:
+        np.testing.assert_array_equal(getattr(found.boundary, name), getattr(rows.boundary, name))
+    assert found.sample_id.tolist() == [7, 3, 5]
+    assert set(found.columns) == {"start_xyz", "goal_xyz", "hit_angle"}
+    np.testing.assert_allclose(found.columns["goal_xyz"], rows.columns["goal_xyz"], atol=1e-12)
+    assert np.isnan(found.path_control_points).all()
+    assert found.source == "boundary conditions in tasks.h5"
+
+
+def test_what_is_left_out_is_zero_and_goal_accelerations_are_kept_where_they_are_given(write) -> None:
+    still = load_boundary_problems(write(start_dq=None, start_ddq=None, goal_dq=None), problem=RECORD)
+    assert not np.any([still.boundary.start_dq, still.boundary.start_ddq, still.boundary.goal_dq])
+    assert still.boundary.goal_ddq is None
+    fixed = load_boundary_problems(write(goal_ddq=np.full((3, 6), 0.5)), problem=RECORD)
+    np.testing.assert_array_equal(fixed.boundary.goal_ddq, np.full((3, 6), 0.5))
+
+
+def test_a_file_may_say_its_problem_itself(write) -> None:
+    assert load_boundary_problems(write(attributes={"problem": "airhockey"})).problem == RECORD
+    texts = {"problem_recipe": RECORD.recipe, "problem_urdf": RECORD.urdf, "problem_sha256": RECORD.digest}
+    assert load_boundary_problems(write(attributes=texts)).problem == RECORD
+
+
+def test_a_shard_is_of_the_problem_of_its_dataset_and_needs_one_without_it(tiny: Tiny, tmp_path: Path, rows) -> None:
+    shard = tiny("airhockey-replan") / "train" / "shard-00000.h5"
+    found = load_boundary_problems(shard)
+    assert found.problem.digest == RECORD.digest
+    np.testing.assert_array_equal(found.boundary.start_ddq[:3], rows.boundary.start_ddq)
+    with pytest.raises(DatasetError, match="boundary problems of problem 'airhockey', not of 'heavy-object'"):
+        load_boundary_problems(shard, problem="heavy-object")
+    alone = shutil.copy(shard, tmp_path / "alone.h5")
+    with pytest.raises(DatasetError, match=r"does not say its problem: .*--problem of 'solve'"):
+        load_boundary_problems(alone)
+    assert len(load_boundary_problems(alone, problem="airhockey")) == len(found)
+
+
+def test_plans_in_a_file_are_not_looked_at(tmp_path: Path, rows) -> None:
+    save_plans(tmp_path / "plans.h5", solve_plans(rows, workers=1).plans)
+    found = load_boundary_problems(tmp_path / "plans.h5")
+    assert np.isnan(found.path_control_points).all()
+    np.testing.assert_array_equal(found.boundary.goal_dq, rows.boundary.goal_dq)
+
+
+@pytest.mark.parametrize(
+    ("changed", "attributes", "message"),
+    [
+        ({"goal_q": None, "start_q": None}, {}, r"lacks start_q and goal_q: boundary conditions are needed"),
+        ({}, {}, r"does not say its problem: set its attribute 'problem'"),
+        ({}, {"problem": "airhokey"}, r"attribute 'problem'.*did you mean 'airhockey'"),
+        ({}, {"problem": "airhockey", "problem_sha256": "0" * 64}, r"is of another 'airhockey'"),
+        ({"start_q": np.zeros((3, 7))}, {"problem": "airhockey"}, r"start_q must have shape \(6,\) or \(N, 6\)"),
+        ({"start_dq": np.zeros((2, 6))}, {"problem": "airhockey"}, r"start_dq has 2 rows, another .* has 3"),
+        ({"goal_q": np.full((3, 6), np.nan)}, {"problem": "airhockey"}, r"goal_q must be finite, got .* in row 0"),
+        ({"goal_q": [["a"] * 6] * 3}, {"problem": "airhockey"}, r"goal_q must be an array of numbers"),
+        ({"sample_id": np.array([0.5] * 3)}, {"problem": "airhockey"}, r"sample_id must hold 3 integers"),
+        ({"hit_angle": np.zeros(2)}, {"problem": "airhockey"}, r"hit_angle must have shape \(3,\)"),
+    ],
+)
+def test_a_file_that_cannot_be_meant_is_refused_by_name(write, changed, attributes, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        load_boundary_problems(write(attributes=attributes, **changed))
+
+
+def test_a_problem_that_a_file_is_not_of_is_refused(write) -> None:
+    with pytest.raises(DatasetError, match="of another problem than 'airhockey': its problem_sha256"):
+        load_boundary_problems(write(attributes={"problem_sha256": "0" * 64}), problem="airhockey")
+    with pytest.raises(DatasetError, match="boundary problems of problem 'airhockey', not of 'heavy-object'"):
+        load_boundary_problems(write(attributes={"problem": "airhockey"}), problem="heavy-object")
+    with pytest.raises(RecipeError, match="did you mean 'airhockey'"):
+        load_boundary_problems(write(), problem="airhokey")
+
+
+def test_what_is_for_folders_is_refused_of_files_and_the_other_way_round(tiny: Tiny, write, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="split, start and n choose rows of the folder"):
+        load_boundary_problems(write(), n=2)
+    with pytest.raises(UsageError, match="problem says which problem a file is of"):
+        load_boundary_problems(tiny("airhockey-hit"), problem="airhockey")
+    with pytest.raises(UsageError, match=r"nowhere\.h5 is not there"):
+        load_boundary_problems(tmp_path / "nowhere.h5")
+    with pytest.raises(UsageError, match="nowhere is not there, expected the folder of a dataset"):
+        load_boundary_problems(tmp_path / "nowhere")
+    with pytest.raises(CnpgenError, match="model of cnpgen"):
+        load_boundary_problems(Path(__file__).parents[2] / "datasets" / "models" / "airhockey-hit.h5")
+
+
+def test_solve_makes_plans_for_a_file_of_boundary_conditions(rows, write, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    write("tasks.h5")
+    assert main(["solve", "tasks.h5", "--problem", "airhockey", "--quiet", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["file"] == "tasks-plans.h5"
+    made, expected = load_plans("tasks-plans.h5"), solve_plans(rows, workers=1).plans
+    assert (made.status == PlanStatus.VALID).all()
+    np.testing.assert_allclose(made.path_control_points, expected.path_control_points, atol=1e-9)
+    np.testing.assert_allclose(made.rate_control_points, expected.rate_control_points, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["tasks.h5"], "tasks.h5 does not say its problem: set its attribute 'problem' to a name or a file, or pass"),
+        (["tasks.h5", "--n", "2"], "--split, --first and --n are for the folder of a dataset, got a file"),
+        (["tasks.h5", "--seed", "2"], "--seed is for fresh draws of a recipe, got a file of boundary conditions"),
+        (["airhockey-hit", "--n", "1", "--problem", "airhockey"], "--problem is for boundary conditions in HDF5"),
+        (["empty.h5", "--problem", "airhockey"], "no boundary conditions in empty.h5"),
+    ],
+)
+def test_options_of_solve_that_mean_nothing_for_what_is_given_are_refused(
+    words: list[str], line: str, write, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write("tasks.h5")
+    write("empty.h5", **dict.fromkeys(CONDITIONS, np.zeros((0, 6))))
+    assert main(["solve", *words]) in {1, 2}
+    assert f"cnpgen: error: {line}" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.h5", "tasks.h5"]
