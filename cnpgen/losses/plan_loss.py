@@ -18,6 +18,7 @@ from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
+from cnpgen.machine.threads import one_thread
 from cnpgen.problems.load import as_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
@@ -101,6 +102,7 @@ class PlanLoss:
         """Leave out what was built for this process; it is built again when it is needed."""
         return {name: part for name, part in vars(self).items() if name not in _BUILT}
 
+    @one_thread()
     def __call__(
         self,
         path: ArrayLike,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
+from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.curves import FIXED_AT_GOAL
@@ -88,6 +89,7 @@ class Omega:
             prepare = prepare_tasks(problem, robot, kernels, bending_steps=self._bending if bent else 0)
             return prepare, make_landing(problem, kernels, steps=self._landed) if bent and self._landed else None
 
+    @one_thread()
     def tasks(self, boundary: Boundary) -> Tasks:
         """Prepare N tasks: what follows from their boundary conditions before any network runs.
 
@@ -112,6 +114,7 @@ class Omega:
         """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""
         return obstacle_tops(self.problem, tasks.start_xyz, tasks.goal_xyz)
 
+    @one_thread()
     def __call__(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
         """Compute control points, in float64.
 
@@ -129,6 +132,7 @@ class Omega:
         with np.errstate(all="ignore"):  # what overflows does so in its own row
             return replace(points, path=landing.land(points.path, self.tops(tasks)))
 
+    @one_thread()
     def pull_back(
         self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
     ) -> tuple[Array, Array]:

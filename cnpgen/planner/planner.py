@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.machine.threads import one_thread
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
@@ -94,6 +95,7 @@ class Planner:
             raise UsageError("goal_q is missing: plan(start_q, start_dq, start_ddq, goal_q, goal_dq)")
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
 
+    @one_thread()
     def plan_batch(
         self,
         boundary: Boundary,
