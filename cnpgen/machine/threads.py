@@ -98,7 +98,7 @@ def _libraries() -> tuple[list[Any], list[Any]]:
 
 
 def _set_threads(library: Any, count: int) -> None:
-    """Set the threads of a library from any Python thread: newer versions of threadpoolctl listen to only one of them."""
+    """Set the threads of a library from any Python thread: newer threadpoolctl listens to only one of them."""
     release = getattr(library, "clear_controlling_thread", None)
     if release is not None:
         release(force=True)
