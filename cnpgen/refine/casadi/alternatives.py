@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.machine.signals import Received, signals_held_back
+from cnpgen.machine.signals import Received, signals_wait
 from cnpgen.refine.casadi.programme import Programme
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.sqp import Result, Settings
@@ -48,7 +48,7 @@ def minimise_with(motion: Transcription, bounds: Bounds, x: Array, settings: Set
         settings: Number of iterations and tolerances; trust region and proximal term are the own solver's alone.
         solver: Name of the CasADi plug-in.
     """
-    with signals_held_back() as received, np.errstate(all="ignore"):  # steps into what is no number are taken back
+    with signals_wait() as received, np.errstate(all="ignore"):  # steps into what is no number are taken back
         return _rounds(motion, _Watch(bounds, settings, received), x, solver=solver)
 
 
@@ -61,7 +61,7 @@ def _rounds(motion: Transcription, watch: "_Watch", x: Array, *, solver: str) ->
         at = motion.evaluate(end)
         violation = bounds.violation(at.g)
         watch.offer(end, at.cost, violation)
-        if watch.received or steps >= limit or (number > 1 and violation < settings.violation_tolerance):
+        if watch.received.came or steps >= limit or (number > 1 and violation < settings.violation_tolerance):
             break
         held |= _choose(at.g, bounds)
         watch.begin(settings.cost_tolerance * (LATER if number else FIRST))
@@ -80,7 +80,7 @@ class _Watch:
     Attributes:
         bounds: Bounds of all residuals, held or not.
         settings: Tolerances.
-        received: Signals that have come meanwhile: one ends the run.
+        received: Whether a signal has come meanwhile: it ends the run.
         x: The best variables: feasible or of the smallest violation, then of the smallest cost.
         cost: Objective there.
         violation: Worst violation there.
@@ -115,7 +115,7 @@ class _Watch:
         self.costs.append(at.cost if met else np.nan)
         last = self.costs[-QUIET:]
         quiet = len(last) == QUIET and max(last) - min(last) < self.little * at.cost
-        return float(quiet or bool(self.received))
+        return float(quiet or self.received.came)
 
 
 def _choose(g: Array, bounds: Bounds) -> NDArray[np.bool_]:
