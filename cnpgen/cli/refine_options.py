@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import Options, Parser, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
@@ -41,7 +41,7 @@ def add_options(parser: Parser) -> None:
     add_json(parser)
 
 
-def add_refining(parser: argparse._ActionsContainer) -> None:
+def add_refining(parser: Options) -> None:
     """Add the options that say how plans are refined: ``REFINING``."""
     option = parser.add_argument
     option(

@@ -114,12 +114,12 @@ def _start_helpers() -> None:
     """
     sys.warnoptions.append(_TIDIED)
     try:
-        with suppress(ImportError, AttributeError):
-            from joblib.externals.loky.backend import resource_tracker as loky_tracker
-
-            loky_tracker._resource_tracker.ensure_running()
+        with suppress(ImportError):
             from multiprocessing import resource_tracker
 
+            from joblib.externals.loky.backend import resource_tracker as loky_tracker
+
+            loky_tracker.ensure_running()
             resource_tracker.ensure_running()
     finally:
         sys.warnoptions.remove(_TIDIED)

@@ -1,4 +1,9 @@
-"""Batches as tensors on NumPy's memory, alone and through a ``DataLoader``."""
+"""Batches as tensors on NumPy's memory, alone and through a ``DataLoader``.
+
+What a ``DataLoader`` does with a type of its own is said in ``default_collate_fn_map``: the documentation of torch's
+``default_collate`` has users change it in place, and gives no other path to it than the one below, which looks private.
+It is changed where batches are iterated, in every worker, and not when this module is imported.
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -56,9 +61,6 @@ def _refuse_batch(*_: Any, **__: Any) -> None:
     raise UsageError("these are batches already: give the DataLoader of a BatchDataset batch_size=None")
 
 
-default_collate_fn_map[TensorBatch] = _refuse_batch  # else torch would stack batches, one by one, to shape (1, B, ...)
-
-
 class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
     """Batches for a ``DataLoader(..., batch_size=None)``: every loop gives the rest of an epoch.
 
@@ -81,6 +83,7 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         return len(self.batches)
 
     def __iter__(self) -> Iterator[TensorBatch]:
+        default_collate_fn_map[TensorBatch] = _refuse_batch  # else torch would stack batches to shape (1, B, ...)
         worker = data.get_worker_info()
         if worker is None:
             return map(to_torch, self.batches)
