@@ -144,6 +144,10 @@ class PlanLoss:
             total = terms[:, 0] + terms[:, 1:] @ scales
         return LossValue(total, terms, path_gradient, rate_gradient)
 
+    def load_kernels(self) -> None:
+        """Load what gradients are computed with, compiling it where it is not cached; else the first call does."""
+        self._gradient  # noqa: B018 - loaded when it is first asked for
+
     def _integrate(
         self, batch: PlanBatch, weights: Array, table: BasisTable, *, gradient: bool
     ) -> tuple[Array, Array, Array]:
