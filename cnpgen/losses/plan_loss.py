@@ -23,7 +23,7 @@ from cnpgen.problems.load import as_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
-from cnpgen.schema.arguments import flag, number, real_array
+from cnpgen.schema.arguments import flag, number, numbers
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
@@ -196,7 +196,7 @@ class PlanLoss:
         Raises:
             UsageError: The shape is wrong, or a weight is negative or not finite.
         """
-        given = real_array("weights", weights, "float64")
+        given = numbers("weights", weights)
         self._check_count(given.shape)
         for name, weight in zip(self.terms[1:], given.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:

@@ -26,7 +26,7 @@ from cnpgen.problems.load import as_problem
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.schema.arguments import integer, number, real_array
+from cnpgen.schema.arguments import integer, number, numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -103,7 +103,7 @@ class Omega:
         given = dict(vars(boundary))
         if given.pop("goal_ddq") is not None:
             raise UsageError("goal accelerations are left free, so goal_ddq must be None")
-        arrays = {name: real_array(name, values, "float64") for name, values in given.items()}
+        arrays = {name: numbers(name, values) for name, values in given.items()}
         shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
         for name, array in arrays.items():
             if array.shape != shape:
@@ -184,7 +184,7 @@ class Omega:
                 raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
 
     def _before_landing(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
-        phi, log_rate = real_array("phi", phi, "float64"), real_array("log_rate", log_rate, "float64")
+        phi, log_rate = numbers("phi", phi), numbers("log_rate", log_rate)
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
             return control_points.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)

@@ -14,7 +14,7 @@ from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, record_problem
-from cnpgen.schema.arguments import integer
+from cnpgen.schema.arguments import integer, numbers
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 
@@ -127,16 +127,16 @@ def make_plans(
         UsageError: Something has the wrong shape.
     """
     record = problem if isinstance(problem, ProblemRecord) else record_problem(problem)
-    path = _floats("path_control_points", path_control_points)
-    parts = {name: None if part is None else _floats(name, part) for name, part in vars(boundary).items()}
+    path = numbers("path_control_points", path_control_points)
+    parts = {name: None if part is None else numbers(name, part) for name, part in vars(boundary).items()}
     rows = path.shape[0] if path.ndim else 0
     plans = Plans(
         problem=record,
         boundary=Boundary(**parts),  # type: ignore[arg-type]
         path_control_points=path,
-        rate_control_points=_floats("rate_control_points", rate_control_points),
+        rate_control_points=numbers("rate_control_points", rate_control_points),
         degree=record.trajectory.degree if degree is None else degree,
-        columns={name: _floats(name, values) for name, values in (columns or {}).items()},
+        columns={name: numbers(name, values) for name, values in (columns or {}).items()},
         sample_id=np.arange(rows) if sample_id is None else _integers("sample_id", sample_id, np.int64),
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
         source=source,
@@ -198,14 +198,6 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
     found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
     return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
-
-
-def _floats(name: str, values: ArrayLike) -> Array:
-    """Return values as an array of floats, nan included."""
-    try:
-        return np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers with rows of equal length: {error}") from error
 
 
 def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:
