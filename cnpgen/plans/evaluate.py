@@ -17,6 +17,7 @@ from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.record import open_problem
+from cnpgen.schema.arguments import number
 
 FORMAT = "cnpgen-evaluation"
 FORMAT_VERSION = 1
@@ -97,7 +98,7 @@ def evaluate_plans(
         MachineError: A worker died.
     """
     check_plans_type(plans)
-    check_step(step)
+    check_step(step := number("step", step))
     parts = [plans.select(slice(first, first + PART)) for first in range(0, len(plans), PART)]
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, len(parts))
     verdicts: list[list[Verdict]] = []

@@ -46,7 +46,7 @@ class RefineOptions:
         if self.weight is not None and number("weight", self.weight) < 0:
             raise UsageError(f"the weight of an objective must not be negative, got {self.weight}")
         integer("max_iterations", self.max_iterations, least=0)
-        check_step(self.step, COARSEST)
+        check_step(number("step", self.step), COARSEST)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
 

@@ -21,7 +21,6 @@ from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.arguments import number
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
@@ -111,15 +110,14 @@ class Judge:
         ]
 
 
-def check_step(step: object, most: float = LONGEST_STEP) -> None:
-    """Refuse a time step [s] that is no number above 0 and at most ``most``.
+def check_step(step: float, most: float = LONGEST_STEP) -> None:
+    """Refuse a time step [s] that is not above 0 and at most ``most``.
 
     Raises:
         UsageError: It does not.
     """
-    seconds = number("the time step [s]", step)
-    if not 0 < seconds <= most:
-        raise UsageError(f"the time step must be above 0 and at most {most:g} s, got {seconds:g} s")
+    if not 0 < step <= most:
+        raise UsageError(f"the time step must be above 0 and at most {most:g} s, got {step:g} s")
 
 
 @dataclass(frozen=True)
