@@ -3,15 +3,14 @@
 import os
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
+
+from cnpgen.machine.signals import signals_taken
 
 INTERRUPTED, TERMINATED = 130, 143  # exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it
-ECHO_SECONDS = 1.0  # a terminal and a wrapper such as ``uv run`` both pass on the same Ctrl-C
 
-_received: list[tuple[int, float]] = []  # the signal that came first, and when [s]
+_interruptions: list[int] = []  # the signal that came first, if any
 
 
 class Terminated(KeyboardInterrupt):
@@ -30,16 +29,17 @@ def raise_if_interrupted() -> None:
         KeyboardInterrupt: The process was interrupted.
         Terminated: The process was asked to end.
     """
-    if _received:
-        raise Terminated if _received[0][0] == signal.SIGTERM else KeyboardInterrupt
+    if _interruptions:
+        raise Terminated if _interruptions[0] == signal.SIGTERM else KeyboardInterrupt
 
 
-def _handle(number: int, _frame: FrameType | None) -> None:
-    if not _received:
-        _received.append((number, time.monotonic()))
-        raise_if_interrupted()
-    elif time.monotonic() - _received[0][1] > ECHO_SECONDS:
-        os._exit(128 + number)
+def _interrupt(number: int) -> None:
+    _interruptions.append(number)
+    raise_if_interrupted()
+
+
+def _end(number: int) -> None:
+    os._exit(128 + number)
 
 
 @contextmanager
@@ -47,21 +47,13 @@ def interruptible() -> Iterator[None]:
     """Raise ``KeyboardInterrupt`` or ``Terminated`` in this block at the first signal; at a later one, end at once.
 
     What was begun is tidied up after the first; workers end with their parent in either case. Once a signal came, the
-    handlers stay until the process ends, so that none interrupts its last steps with a traceback. Signals that the
-    process was started to ignore are ignored.
+    handlers stay until the process ends, so that none interrupts its last steps with a traceback.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
-        return
-    _received.clear()
-    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) not in (signal.SIG_IGN, None)]
-    before = {number: signal.signal(number, _handle) for number in numbers}
-    try:
-        yield
-    except Exception:
-        raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
-        raise
-    finally:
-        if not _received:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    if threading.current_thread() is threading.main_thread():
+        _interruptions.clear()
+    with signals_taken(_interrupt, _end, stay=True):
+        try:
+            yield
+        except Exception:
+            raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
+            raise

@@ -1,4 +1,9 @@
-"""argparse with errors of one line that name what was probably meant."""
+"""argparse with errors of one line that name what was probably meant.
+
+argparse lets nobody say by public names what a choice is refused with, how wide the column of the commands is, which
+options a parser knows, or of which types what it returns is. This module alone uses the private ones; others take
+``Commands`` and ``Options`` from here. The tests of the errors show it where they have changed.
+"""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -50,6 +55,7 @@ class Parser(argparse.ArgumentParser):
 
 
 Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: commands are added to it
+Options = argparse._ActionsContainer  # a parser or a group of its options: options are added to it
 
 
 def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title: str, text: str = "") -> Parser:

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.parser import Options, Parser, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from cnpgen.machine.times import Times
     from cnpgen.plans import Plans
     from cnpgen.refine.plans import Refinement
 
@@ -43,7 +44,7 @@ def add_options(parser: Parser) -> None:
     add_json(parser)
 
 
-def add_refining(parser: argparse._ActionsContainer) -> None:
+def add_refining(parser: Options) -> None:
     """Add the options that say how plans are refined: ``REFINING``."""
     option = parser.add_argument
     option(
@@ -118,7 +119,7 @@ def refine_and_save(
         meter.close()
     save_plans(out, found.plans)
     journal.unlink(missing_ok=True)
-    _tell(arguments, facts, out, meter.seconds)
+    _tell(arguments, facts, out, found.times)
     return 0 if found.valid.all() else 1
 
 
@@ -134,9 +135,9 @@ def check_place(out: Path, *, force: bool) -> None:
     check_replaceable(out)
 
 
-def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, seconds: float) -> None:
+def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, times: "Times") -> None:
     if not arguments.quiet:
-        lines = _summary(facts, seconds, listed=facts["plans"] if arguments.explain else LISTED)
+        lines = _summary(facts, times, listed=facts["plans"] if arguments.explain else LISTED)
         print("\n".join(lines), file=sys.stderr)
     print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
 
@@ -153,13 +154,13 @@ def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
         meter(1)
 
 
-def _summary(facts: dict[str, Any], seconds: float, *, listed: int) -> list[str]:
+def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
     """Say in a few lines what came of the plans."""
     from cnpgen.refine.plans import outcome_text
 
     mean = facts["mean_duration_s"]
     lines = [
-        f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {seconds:.1f} s"
+        f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}"
         + ("" if mean is None else f"; mean motion time {mean:.4f} s")
     ]
     lines += [f"  {count:,} {outcome_text(name)}" for name, count in facts["outcomes"].items()]

@@ -88,7 +88,8 @@ def summary(trained: "Trained") -> str:
             f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
         )
     return _fitted(
-        f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time; the model of step"
+        f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time and"
+        f" {training['validation_cpu_seconds']:.0f} s for validations; this run took {trained.times}; the model of step"
         f" {training['best_step']:,} is kept: {words}"
     )
 

@@ -18,11 +18,12 @@ from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
+from cnpgen.machine.threads import one_thread
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
-from cnpgen.schema.arguments import flag, number, real_array
+from cnpgen.schema.arguments import flag, number, numbers
 from cnpgen.store.blueprint import StoredProblem
 
 Array = NDArray[Any]
@@ -106,6 +107,7 @@ class PlanLoss:
         """Leave out what was built for this process; it is built again when it is needed."""
         return {name: part for name, part in vars(self).items() if name not in _BUILT}
 
+    @one_thread()
     def __call__(
         self,
         path: ArrayLike,
@@ -147,6 +149,10 @@ class PlanLoss:
                 terms[rows], path_gradient[rows], rate_gradient[rows] = (part.back(values) for values in results)
             total = terms[:, 0] + terms[:, 1:] @ scales
         return LossValue(total, terms, path_gradient, rate_gradient)
+
+    def load_kernels(self) -> None:
+        """Load what gradients are computed with, compiling it where it is not cached; else the first call does."""
+        self._gradient  # noqa: B018 - loaded when it is first asked for
 
     def _integrate(
         self, batch: PlanBatch, weights: Array, table: BasisTable, *, gradient: bool
@@ -212,7 +218,7 @@ class PlanLoss:
         Raises:
             UsageError: The shape is wrong, a weight is negative or not finite, or there is no such term.
         """
-        given = real_array("weights", self.in_order(weights), "float64")
+        given = numbers("weights", self.in_order(weights))
         self._check_count(given.shape)
         for name, weight in zip(self.terms[1:], given.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:

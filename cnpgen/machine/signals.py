@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM noted instead of handled, while something runs that must not be cut off."""
+"""SIGINT and SIGTERM while something runs: who is told of the first one, and of one that comes again."""
 
 import signal
 import threading
@@ -7,85 +7,83 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
-Handler = Callable[[int, FrameType | None], object]
-
-
-@contextmanager
-def signals_noted(note: Handler) -> Iterator[dict[int, Handler]]:
-    """Let ``note`` take SIGINT and SIGTERM in this block; the handlers are back at its end.
-
-    Signals that are ignored or end the process without Python stay as they are, and so do all of them outside of the
-    main thread, which alone may set handlers.
-
-    Yields:
-        The handlers that are replaced, by the signal's number.
-    """
-    before: dict[int, Handler] = {}
-    if threading.current_thread() is threading.main_thread():
-        handlers = {int(number): signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        before = {number: handler for number, handler in handlers.items() if callable(handler)}
-    for number in before:
-        signal.signal(number, note)
-    try:
-        yield before
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-Received = list[tuple[int, FrameType | None]]
-
-
-@contextmanager
-def signals_held_back() -> Iterator[Received]:
-    """Note SIGINT and SIGTERM in this block instead of handling them; handle the first one at its end.
-
-    Yields:
-        What has come so far: whoever is called back in the block looks whether it is to end.
-    """
-    received: Received = []
-    before: dict[int, Handler] = {}
-    try:
-        with signals_noted(lambda number, frame: received.append((number, frame))) as before:
-            yield received
-    finally:
-        for first, frame in received[:1]:
-            before[first](first, frame)
-
-
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
 ECHO_SECONDS = 1.0  # a terminal and a wrapper such as ``uv run`` both pass on the same Ctrl-C
+
+Told = Callable[[int], object]
 
 
 @dataclass
-class Waiting:
-    """Which signal waits.
+class Received:
+    """What has come so far.
 
     Attributes:
-        number: The first signal that came; None before.
+        number: The first signal; None before.
         since: When it came [s].
     """
 
     number: int | None = None
     since: float = 0.0
 
+    @property
+    def came(self) -> bool:
+        """Whether one has come."""
+        return self.number is not None
+
 
 @contextmanager
-def signals_wait() -> Iterator[Waiting]:
-    """Let SIGINT and SIGTERM wait until the end of the block, where they take their effect.
+def signals_taken(first: Told, again: Told, *, stay: bool = False) -> Iterator[Received]:
+    """Tell ``first`` of the first signal in this block, and ``again`` of those more than ``ECHO_SECONDS`` after it.
 
-    A second one, more than a second later, does not wait. Signals that are ignored or end the process without Python
-    stay as they are, and so do all of them outside of the main thread.
+    Signals that are ignored stay so, and so do all of them outside of the main thread, which alone may set handlers.
+
+    Args:
+        first: Called with the number of the first signal.
+        again: Called with the number of a later one.
+        stay: Whether the handlers stay after the block once a signal has come; else those from before are back.
     """
-    waiting = Waiting()
+    received, before = Received(), _handlers()
 
-    def note(number: int, frame: FrameType | None) -> None:
-        if waiting.number is None:
-            waiting.number, waiting.since = number, time.monotonic()
-        elif time.monotonic() - waiting.since > ECHO_SECONDS:
-            handlers[number](number, frame)
+    def take(number: int, _frame: FrameType | None) -> None:
+        if not received.came:
+            received.number, received.since = number, time.monotonic()
+            first(number)
+        elif time.monotonic() - received.since > ECHO_SECONDS:
+            again(number)
 
-    with signals_noted(note) as handlers:
-        yield waiting
-    if waiting.number is not None:
-        signal.raise_signal(waiting.number)
+    for number in before:
+        signal.signal(number, take)
+    try:
+        yield received
+    finally:
+        if not (stay and received.came):
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@contextmanager
+def signals_wait() -> Iterator[Received]:
+    """Let a signal wait until the end of the block, where it takes its effect; one that comes again does not wait."""
+    before, waiting = _handlers(), Received()
+
+    def effect(number: int) -> None:
+        waiting.number = None
+        signal.signal(number, before[number])
+        signal.raise_signal(number)
+
+    try:
+        with signals_taken(lambda _: None, effect) as waiting:
+            yield waiting
+    finally:
+        if waiting.number is not None:
+            signal.raise_signal(waiting.number)
+
+
+def _handlers() -> dict[int, Any]:
+    """Return the handlers that may be replaced, by the number of their signal."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    found = {int(number): signal.getsignal(number) for number in NUMBERS}
+    return {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}

@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.machine.signals import NUMBERS, signals_wait
 from cnpgen.schema.arguments import integer
 
-_HELD = (signal.SIGINT, signal.SIGTERM)
 _TIDIED = "ignore:resource_tracker:UserWarning"  # as the option -W takes it: the beginning of the message
 WATCH_SECONDS = 0.5  # how often a worker looks whether the process that started it is still there
 
@@ -92,23 +92,18 @@ def _signals_held() -> Iterator[None]:
     """Let processes be started that never see Ctrl-C, which a terminal sends to all of them.
 
     A process inherits the signals that are blocked when it is started. Only this process acts on them, at the end of
-    the block, and ends the others.
+    the block, and ends the others. A thread of this process that blocks nothing may get a signal: it waits, too.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     _start_helpers()
-    held: list[int] = []
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD)
-    handlers = _record(held)  # another thread of this process, which blocks nothing, may get the signal
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number in held:
-            signal.raise_signal(number)
+    with signals_wait():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _start_helpers() -> None:
@@ -119,23 +114,15 @@ def _start_helpers() -> None:
     """
     sys.warnoptions.append(_TIDIED)
     try:
-        with suppress(ImportError, AttributeError):
-            from joblib.externals.loky.backend import resource_tracker as loky_tracker
-
-            loky_tracker._resource_tracker.ensure_running()
+        with suppress(ImportError):
             from multiprocessing import resource_tracker
 
+            from joblib.externals.loky.backend import resource_tracker as loky_tracker
+
+            loky_tracker.ensure_running()
             resource_tracker.ensure_running()
     finally:
         sys.warnoptions.remove(_TIDIED)
-
-
-def _record(held: list[int]) -> dict[int, Any]:
-    """Let signals be noted in a list instead of handled, where this thread may decide so; return the handlers."""
-    if threading.current_thread() is not threading.main_thread():
-        return {}
-    numbers = [number for number in _HELD if signal.getsignal(number) is not None]
-    return {number: signal.signal(number, lambda number, _frame: held.append(number)) for number in numbers}
 
 
 def _end_with(parent: int) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
+from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.curves import FIXED_AT_GOAL
@@ -26,7 +27,7 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import as_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.schema.arguments import integer, number, real_array
+from cnpgen.schema.arguments import integer, number, numbers
 from cnpgen.store.blueprint import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 
@@ -91,6 +92,7 @@ class Omega:
             prepare = prepare_tasks(problem, robot, kernels, bending_steps=self._bending if bent else 0)
             return prepare, make_landing(problem, kernels, steps=self._landed) if bent and self._landed else None
 
+    @one_thread()
     def tasks(self, boundary: Boundary) -> Tasks:
         """Prepare N tasks: what follows from their boundary conditions before any network runs.
 
@@ -104,7 +106,7 @@ class Omega:
         given = dict(vars(boundary))
         if given.pop("goal_ddq") is not None:
             raise UsageError("goal accelerations are left free, so goal_ddq must be None")
-        arrays = {name: real_array(name, values, "float64") for name, values in given.items()}
+        arrays = {name: numbers(name, values) for name, values in given.items()}
         shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
         for name, array in arrays.items():
             if array.shape != shape:
@@ -117,6 +119,7 @@ class Omega:
         """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""
         return obstacle_tops(self.problem, tasks.start_xyz, tasks.goal_xyz)
 
+    @one_thread()
     def __call__(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
         """Compute control points, in float64.
 
@@ -134,6 +137,7 @@ class Omega:
         with np.errstate(all="ignore"):  # what overflows does so in its own row
             return replace(points, path=landing.land(points.path, self.tops(tasks)))
 
+    @one_thread()
     def pull_back(
         self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
     ) -> tuple[Array, Array]:
@@ -197,7 +201,7 @@ class Omega:
                 raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
 
     def _before_landing(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
-        phi, log_rate = real_array("phi", phi, "float64"), real_array("log_rate", log_rate, "float64")
+        phi, log_rate = numbers("phi", phi), numbers("log_rate", log_rate)
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
             return control_points.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)

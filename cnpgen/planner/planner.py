@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.machine.threads import one_thread
 from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import warn_of_far_joints
+from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
 from cnpgen.trajectory.moment import states_at_times
@@ -96,6 +98,7 @@ class Planner:
         """
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
 
+    @one_thread()
     def plan_batch(
         self,
         boundary: Boundary,
@@ -169,8 +172,8 @@ def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
         UsageError: There are not as many times as plans, or one is not within its plan.
     """
     try:
-        times = np.broadcast_to(np.asarray(time, np.float64), (len(plans),))
-    except (TypeError, ValueError) as error:
+        times = np.broadcast_to(numbers("time", time), (len(plans),))
+    except (UsageError, ValueError) as error:
         raise UsageError(f"time must be one number or one for each of {len(plans)} plans, got {time!r}") from error
     outside = ~((times >= 0) & (times <= plans.duration))
     if outside.any():

@@ -18,6 +18,7 @@ from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.record import open_problem
+from cnpgen.schema.arguments import number
 
 FORMAT = "cnpgen-evaluation"
 FORMAT_VERSION = 1
@@ -99,7 +100,7 @@ def evaluate_plans(
         MachineError: A worker died.
     """
     check_plans_type(plans)
-    check_step(step)
+    check_step(step := number("step", step))
     plans = settle_tips(plans)
     parts = [plans[first : first + PART] for first in range(0, len(plans), PART)]
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, len(parts))

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import counted
 from cnpgen.machine.threads import one_thread
+from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.machine.versions import __version__
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type, screen
@@ -42,11 +44,13 @@ class Refinement:
         given: The plans as they were given.
         plans: The refined plans, in the same order.
         refined: How each of them ended.
+        times: Where the time went; plans that a journal held took none.
     """
 
     given: Plans
     plans: Plans
     refined: tuple[Refined, ...]
+    times: Times = NO_TIME
 
     def __repr__(self) -> str:
         outcomes = _counted(each.outcome.name.lower() for each in self.refined)
@@ -71,6 +75,7 @@ class Refinement:
             "reasons": _counted(each.reason for each in self.refined if not each.valid),
             "mean_duration_s": float(durations.mean()) if len(durations) else None,
             "median_iterations": float(np.median([each.iterations for each in self.refined])) if self.refined else None,
+            "seconds": self.times.rounded(),
             "not_valid": [
                 {"plan": index, "sample_id": int(sample), "reason": str(each.reason), "outcome": each.outcome.text}
                 for index, (sample, each) in enumerate(zip(self.plans.sample_id, self.refined, strict=True))
@@ -153,24 +158,32 @@ def refine_plans(
         MachineError: A worker died, or the journal cannot be written.
     """
     check_plans_type(plans)
+    watch = Stopwatch()
     plans = settle_tips(plans)
     notes = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
     done: dict[int, Refined] = {} if notes is None else dict(notes.finished)
     if begin is not None:
         begin(len(plans), len(done))
     try:
-        for found in _run(plans, [i for i in range(len(plans)) if i not in done], options, workers, notes):
+        waiting = [i for i in range(len(plans)) if i not in done]
+        for found in _run(plans, waiting, options, workers, journal=notes, watch=watch):
             done |= found
             if progress is not None:
                 progress(len(found), sum(each.valid for each in found.values()))
     finally:
         if notes is not None:
             notes.close()
-    return _assembled(plans, [done[i] for i in range(len(plans))], options)
+    return replace(_assembled(plans, [done[i] for i in range(len(plans))], options), times=watch.times())
 
 
 def _run(
-    plans: Plans, waiting: list[int], options: RefineOptions, workers: int | None, journal: Journal | None
+    plans: Plans,
+    waiting: list[int],
+    options: RefineOptions,
+    workers: int | None,
+    *,
+    journal: Journal | None,
+    watch: Stopwatch,
 ) -> Iterator[dict[int, Refined]]:
     if not waiting:
         return
@@ -178,19 +191,22 @@ def _run(
     size = PART if count > 1 else 1
     parts = [waiting[first : first + size] for first in range(0, len(waiting), size)]
     prepare(plans, options)  # kernels are compiled once, not by every worker
+    watch.prepared()
     tasks = ((part, plans[np.array(part)]) for part in parts)
     advice = "" if journal is None else f": {journal.path} holds what is finished; run the same command again to go on"
     with closing(share_out(partial(_refine, options=options), tasks, count, advice=advice)) as results:
-        for part, refined in results:
+        for part, refined, seconds in results:
+            watch.computing += seconds / count
             if journal is not None:
                 journal.append(part, refined)
             yield dict(zip(part, refined, strict=True))
 
 
-def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[list[int], list[Refined]]:
-    part, plans = task
+def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[list[int], list[Refined], float]:
+    """Refine a part; say how much CPU time it took [s]."""
+    (part, plans), begun = task, time.thread_time()
     with one_thread():
-        return part, refine_part(plans, options)
+        return part, refine_part(plans, options), time.thread_time() - begun
 
 
 def _assembled(given: Plans, refined: list[Refined], options: RefineOptions) -> Refinement:

@@ -50,16 +50,30 @@ def number(name: str, value: Any) -> float:
     return found
 
 
-def numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Return an argument as an array of floats, nan and inf included; a tensor's gradient is left behind.
+def numbers(name: str, values: ArrayLike, dtype: str = "float64") -> Array:
+    """Return an argument as an array of floats, nan and inf included; texts, dates and complex numbers are none.
+
+    Args:
+        name: The argument's name.
+        values: What was given: numbers, lists of them, arrays, or tensors on the CPU, whose gradients are left behind.
+        dtype: "float64" or "float32".
 
     Raises:
-        UsageError: It holds something else, or rows of different lengths.
+        UsageError: These are no real numbers, or rows of different lengths, or not in the memory of this process.
     """
+    wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
     try:
-        return np.asarray(values.detach() if hasattr(values, "detach") else values, np.float64)  # torch asks for it
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be an array of numbers with rows of equal length: {error}") from error
+        array = np.asarray(values.detach() if hasattr(values, "detach") else values)  # torch asks for it
+        if array.dtype == dtype:
+            return array
+        with np.errstate(over="ignore"):
+            real: Array = array.real.astype(dtype, copy=False)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
+        uneven = "inhomogeneous" in str(error)
+        raise UsageError(f"{wrong}: {'its rows have different lengths' if uneven else error}") from error
+    if array.dtype.kind in "cUSmM":  # NumPy would drop an imaginary part, and read texts
+        raise UsageError(f"{wrong}: {array.dtype} is no real type")
+    return real
 
 
 def flag(name: str, value: Any) -> bool:
@@ -71,21 +85,3 @@ def flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise UsageError(f"{name} must be True or False, got {value!r:.100}")
     return bool(value)
-
-
-def real_array(name: str, values: ArrayLike, dtype: str) -> Array:
-    """Cast to an array of floats.
-
-    Raises:
-        UsageError: These are no real numbers, or not in the memory of this process.
-    """
-    wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
-    try:
-        array = np.asarray(values)
-        with np.errstate(over="ignore"):
-            real: Array = array.real.astype(dtype, copy=False)
-    except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
-        raise UsageError(f"{wrong}: {error}") from error
-    if array.dtype.kind in "cUSmM":  # NumPy would drop an imaginary part, and read texts
-        raise UsageError(f"{wrong}: {array.dtype} is no real type")
-    return real

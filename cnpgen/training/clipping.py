@@ -36,10 +36,12 @@ class Clipping:
             limit: Largest norm, in running medians; inf for no clipping.
 
         Returns:
-            Shape (N,), in (0, 1].
+            Shape (N,), in (0, 1]; 1 as long as half of the gradients of every batch are zero: there is no measure yet.
         """
         middle = float(np.median(norms))
         self.sample = SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * middle if self.sample else middle
+        if not self.sample or np.isinf(limit):
+            return np.ones_like(norms)
         return np.minimum(1.0, limit * self.sample / np.maximum(norms, 1e-30)).astype(norms.dtype)
 
     def batch_factor(self, norm: float, *, limit: float) -> float:
@@ -50,4 +52,6 @@ class Clipping:
             limit: Largest norm, in running norms; inf for no clipping.
         """
         self.batch = BATCH_MEMORY * self.batch + (1 - BATCH_MEMORY) * min(norm, JUMP * self.batch) or norm
+        if not self.batch or np.isinf(limit):
+            return 1.0
         return min(1.0, limit * self.batch / max(norm, 1e-30))

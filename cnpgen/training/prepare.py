@@ -112,7 +112,9 @@ def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
     backend = given.kernels.backend
     names = PlanLoss(given.problem, nodes=settings.nodes, backend=backend).terms  # its kernels are built when needed
     margins = suggested_margins(names)
-    return PlanLoss(given.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
+    loss = PlanLoss(given.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
+    loss.load_kernels()  # so that no step is slow because of it
+    return loss
 
 
 def _metric(loss: PlanLoss, settings: TrainingSettings) -> Metric:

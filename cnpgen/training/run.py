@@ -80,10 +80,10 @@ class Run:
         gradient = np.empty_like(state.adam.parameters)
         while state.adam.step < state.steps:
             with signals_wait() as waiting:
-                while state.adam.step < state.steps and waiting.number is None:
+                while state.adam.step < state.steps and not waiting.came:
                     self._go_on(state, gradient, journal, watch)
                     checkpoints.save_now_and_then(state)
-                if waiting.number is not None:
+                if waiting.came:
                     checkpoints.save(state)
 
     def _go_on(self, state: State, gradient: Array, journal: TrainingLog, watch: Watcher | None) -> None:

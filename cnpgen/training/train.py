@@ -7,6 +7,7 @@ from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.threads import one_thread
+from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
@@ -36,12 +37,15 @@ class Trained:
         path: Its file.
         score: What ``validate`` says of it on up to 2,000 validation rows that it was not chosen by.
         made: Whether it was made now; False if it was there already.
+        times: Where the time of this run went, the last validation included; of one that was interrupted, since it went
+            on. The model's ``training`` has the CPU time of all steps and validations.
     """
 
     model: Model
     path: Path
     score: Mapping[str, Any]
     made: bool = True
+    times: Times = NO_TIME
 
 
 def train_model(
@@ -86,6 +90,7 @@ def train_model(
         DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """
+    clock = Stopwatch()
     lasts = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
     job = _job(folder, Path(out), settings or TrainingSettings(), lasts, check_rows)
     if not force:
@@ -95,12 +100,15 @@ def train_model(
     with one_thread(), surroundings(as_record(job.source.dataset.problem)) as given:
         run, kit = prepare_run(job.source, given, job.settings, check_rows=job.check_rows, command=command)
         state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
+        clock.prepared()
         if begin is not None:
             begin(state, run)
         journal = TrainingLog(job.out.with_suffix(LOG), state.log)
         run.go_on(state, job.checkpoints, journal, watch)
         job.checkpoints.save(state)
-        return _kept(job, run, state, kit=kit, journal=journal, workers=workers)
+        trained = _kept(job, run, state, kit=kit, journal=journal, workers=workers)
+    clock.computed_here()
+    return replace(trained, times=clock.times())
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, edges_around, extremes, graded_edges, horner, pick, pieces
 
@@ -211,7 +212,7 @@ class Motion:
 
     def _moments(self, what: str, values: ArrayLike) -> Array:
         """Return phases or times as an array of shape (K,) or (N, K)."""
-        found = np.asarray(values, np.float64)
+        found = numbers(what, values)
         if found.ndim not in {1, 2} or (found.ndim == 2 and len(found) != len(self)):
             raise UsageError(f"{what} must have shape (K,) or ({len(self)}, K), got {found.shape}")
         return found

@@ -225,9 +225,10 @@ def test_commands_run_in_other_threads_too():
 def test_a_second_interruption_after_a_second_ends_the_process_at_once():
     code = """
 import os, signal, time
-from cnpgen.cli import interruption
-interruption.ECHO_SECONDS = 0.05
-with interruption.interruptible():
+from cnpgen.cli.interruption import interruptible
+from cnpgen.machine import signals
+signals.ECHO_SECONDS = 0.05
+with interruptible():
     try:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(1)

@@ -1,6 +1,8 @@
 """Signals that wait: nothing is interrupted in the middle, and nothing is swallowed."""
 
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -68,3 +70,42 @@ def test_other_threads_may_train_too():
     thread.start()
     thread.join()
     assert found == [None]
+
+
+def test_a_block_that_fails_swallows_no_signal():
+    def fail() -> None:
+        with signals_wait():
+            signal.raise_signal(signal.SIGINT)
+            raise ZeroDivisionError
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        fail()
+    assert isinstance(caught.value.__context__, ZeroDivisionError)
+
+
+def test_a_block_within_a_block_waits_for_the_outer_one_too():
+    steps: list[str] = []
+
+    def both() -> None:
+        with signals_wait() as outer:
+            with signals_wait() as inner:
+                signal.raise_signal(signal.SIGINT)
+                steps.append(f"inner {inner.came}, outer {outer.came}")
+            steps.append(f"outer {outer.came}")
+
+    with pytest.raises(KeyboardInterrupt):
+        both()
+    assert steps == ["inner True, outer False", "outer True"]
+
+
+def test_a_process_without_handlers_of_its_own_ends_by_the_signal_and_after_the_block():
+    code = """
+import signal
+from cnpgen.machine.signals import signals_wait
+with signals_wait():
+    signal.raise_signal(signal.SIGTERM)
+    print("to the end", flush=True)
+print("not reached")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "to the end\n", "")

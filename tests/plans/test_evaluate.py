@@ -96,7 +96,7 @@ def test_no_plans_have_no_verdicts() -> None:
     assert found.summary()["valid_ratio"] is None
 
 
-@pytest.mark.parametrize("arguments", [{"step": 0.0}, {"step": np.nan}, {"workers": 0}])
+@pytest.mark.parametrize("arguments", [{"step": 0.0}, {"step": np.nan}, {"step": "1ms"}, {"workers": 0}])
 def test_arguments_that_make_no_sense_are_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=r"step|workers"):
         evaluate_plans(plans_of(load("hit")), **arguments)

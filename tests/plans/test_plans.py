@@ -578,7 +578,9 @@ def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(name: 
     others = replace(plans.boundary, **{name: np.zeros((N, 7))})
     with pytest.raises(UsageError, match=rf"{name} must have shape \(7, 6\) \(plans, joints\), got \(7, 7\)"):
         make_plans(plans.problem, others, **points)
-    with pytest.raises(UsageError, match=f"{name} must be an array of numbers with rows of equal length"):
+    with pytest.raises(
+        UsageError, match=f"{name} must be an array of numbers, got list: its rows have different lengths"
+    ):
         make_plans(plans.problem, replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}), **points)
 
 

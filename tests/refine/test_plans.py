@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -65,7 +66,12 @@ def test_solving_begins_from_nothing_whatever_plans_there_are(problems: Plans, s
 
 
 def test_a_refinement_is_printed_as_one_line(problems: Plans) -> None:
+    begun = time.perf_counter()
     found = refine_plans(problems[:2], workers=1)
+    passed = time.perf_counter() - begun
+    assert 0 < found.times.passed <= passed
+    assert found.times.computing > 0
+    assert found.summary()["seconds"] == found.times.rounded()
     outcomes = {each.outcome.name.lower() for each in found.refined}
     text = repr(found)
     assert text.startswith("<2 plans of 'airhockey' refined, 2 valid: ")
@@ -283,9 +289,14 @@ def test_solve_and_refine_write_files_that_evaluate_calls_valid(
 ) -> None:
     out = tmp_path / "plans.h5"
     assert main(["solve", "airhockey-hit", "--n", "3", "--out", str(out), "--workers", "1"]) == 0
-    assert capsys.readouterr().out.strip() == str(out)
+    told = capsys.readouterr()
+    assert told.out.strip() == str(out)
+    assert re.search(
+        r"3 plans valid in [\d.]+ s \([\d.]+ s compiling, [\d.]+ s computing, [\d.]+ s waiting\);", told.err
+    )
     assert main(["refine", str(out), "--json", "--quiet"]) == 0
     said = json.loads(capsys.readouterr().out)
+    assert said["seconds"]["computing"] > 0
     assert (said["plans"], said["valid"], said["not_valid"]) == (3, 3, [])
     assert main(["evaluate", said["file"]]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans-refined.h5", "plans.h5"]

@@ -13,7 +13,7 @@ from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
-from cnpgen.schema.arguments import flag, integer, number
+from cnpgen.schema.arguments import flag, integer, number, numbers
 from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.dataset import validate_dataset
 from tests.conftest import tiny_recipe
@@ -42,6 +42,31 @@ def test_numbers_of_numpy_are_numbers(value: Any) -> None:
 def test_what_is_no_finite_number_is_refused(value: object) -> None:
     with pytest.raises(UsageError, match=r"^x must be a finite number, got "):
         number("x", value)
+
+
+@pytest.mark.parametrize("values", [[1, 2.5], (1, 2.5), np.array([1, 2.5], "f4"), [True, 2.5], np.array([1.0, 2.5])])
+def test_arrays_of_numbers_are_floats_of_the_type_that_was_asked_for(values: Any) -> None:
+    for dtype in ("float64", "float32"):
+        found = numbers("x", values, dtype)
+        assert found.dtype == dtype
+        assert found[1] == 2.5
+    assert not np.isfinite(numbers("x", [np.nan, np.inf])).any()
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ([[1.0], [1.0, 2.0]], "got list: its rows have different lengths"),
+        (["1", "2"], "got list: <U1 is no real type"),
+        ("fast", "got str"),
+        ([1j], "got list: complex128 is no real type"),
+        (np.array(["2026-01-01"], "M8[D]"), r"got ndarray: datetime64\[D\] is no real type"),
+        ([object()], "got list: .*object"),
+    ],
+)
+def test_what_is_no_array_of_numbers_is_refused_with_what_it_is(values: Any, why: str) -> None:
+    with pytest.raises(UsageError, match=f"^x must be an array of numbers, {why}"):
+        numbers("x", values)
 
 
 def test_yes_and_no_are_booleans_and_nothing_else() -> None:

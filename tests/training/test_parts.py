@@ -54,6 +54,15 @@ def test_fewer_rows_than_a_batch_are_one_batch():
     assert sorted(StepRows(5, 64, seed=0).batch(3)) == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("limit", [30.0, np.inf])
+def test_nothing_is_clipped_while_most_gradients_are_zero(limit):
+    clipping, norms = Clipping(), np.array([0.0, 0.0, 0.0, 2.0, 5.0])
+    np.testing.assert_array_equal(clipping.sample_factors(norms, limit=limit), 1.0)
+    assert clipping.batch_factor(0.0, limit=limit) == 1.0
+    np.testing.assert_array_equal(clipping.sample_factors(norms + 1, limit=limit), 1.0)
+    assert clipping.sample == 1.0
+
+
 def test_samples_are_clipped_to_so_many_running_medians():
     clipping = Clipping()
     norms = np.array([1.0, 2.0, 3.0, 4.0, 1000.0])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.cli.train_text import summary
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.losses.metric_settings import BOUNDED
 from cnpgen.make.dataset import make_dataset
@@ -119,6 +120,18 @@ def test_seconds_become_steps_before_the_run_begins(train):
     trained = train(steps=None, cpu_seconds=0.2, begin=lambda state, run: begun.append(state.steps))
     assert begun == [trained.model.training["steps"]]
     assert 10 < begun[0] < 2000
+
+
+def test_the_time_that_passed_is_told_by_what_it_was_used_for(train):
+    begun = time.perf_counter()
+    trained = train()
+    passed, times, training = time.perf_counter() - begun, trained.times, trained.model.training
+    assert 0.5 * passed < times.passed <= passed
+    assert times.compiling > 0
+    assert times.computing >= 0.9 * (training["cpu_seconds"] + training["validation_cpu_seconds"]) - 0.2
+    said = " ".join(summary(trained).split())
+    assert f"{training['cpu_seconds']:.0f} s of CPU time and {training['validation_cpu_seconds']:.0f} s for" in said
+    assert f"this run took {times};" in said
 
 
 def test_epochs_become_steps_too(train):

@@ -14,7 +14,7 @@ from cnpgen.errors import UsageError
 from cnpgen.interop.host import evaluate
 from cnpgen.losses.quadrature import check_quadrature
 from cnpgen.planner.tasks import Tasks
-from cnpgen.schema.arguments import number, real_array
+from cnpgen.schema.arguments import number, numbers
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def _real(name: str, values: Any, dtype: Any) -> jax.Array:
     Raises:
         UsageError: These are no real numbers.
     """
-    array = values if isinstance(values, jax.Array) else jnp.asarray(real_array(name, values, "float64"))
+    array = values if isinstance(values, jax.Array) else jnp.asarray(numbers(name, values))
     if jnp.iscomplexobj(array):
         raise UsageError(f"{name} must be real numbers, got {array.dtype}")
     return array.astype(dtype)

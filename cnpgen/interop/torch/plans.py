@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.host import evaluate
-from cnpgen.schema.arguments import real_array
+from cnpgen.schema.arguments import numbers
 
 if TYPE_CHECKING:
     from cnpgen.losses.plan_loss import PlanLoss
@@ -162,7 +162,7 @@ def _tensor(name: str, values: Any) -> torch.Tensor:
         UsageError: These are no real numbers.
     """
     if not isinstance(values, torch.Tensor):
-        return torch.tensor(real_array(name, values, "float64"))
+        return torch.tensor(numbers(name, values))
     if values.is_complex():
         raise UsageError(f"{name} must be real numbers, got {values.dtype}")
     return values
