@@ -43,7 +43,7 @@ def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:
     elif not other and file.text("recipe_sha256") != model.training.get("dataset", {}).get("recipe_sha256", ""):
         raise DatasetError(
             f"{file.path} is a shard whose dataset is not beside it, and of another recipe than the rows that the model"
-            " was trained on; --other-rows plans for it all the same"
+            " was trained on; other=True plans for it all the same"
         )
 
 

@@ -74,9 +74,9 @@ def check_place(workspace: Workspace) -> None:
         MachineError: It cannot be written.
     """
     if workspace.holds == "a file":
-        raise UsageError(f"{workspace.there} is a file, not a folder; choose another --out")
+        raise UsageError(f"{workspace.there} is a file, not a folder; choose another out=")
     if workspace.holds == "something else":
-        raise UsageError(f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another --out")
+        raise UsageError(f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another out=")
     if not os.access(workspace.there, os.W_OK | os.X_OK):
         raise machine_error("write to", workspace.folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
 
@@ -96,7 +96,7 @@ def begun_blueprint(workspace: Workspace, wanted: Blueprint) -> Blueprint | None
     if not workspace.rows:
         return None
     if found is None:
-        raise DatasetError(f"{workspace.damage}; --force replaces the whole dataset")
+        raise DatasetError(f"{workspace.damage}; force=True replaces the whole dataset")
     raise UsageError(f"{workspace.folder} {_refusal(found, wanted)}")
 
 
@@ -146,7 +146,7 @@ def require_blueprint(folder: Path, blueprint: Blueprint) -> None:
     except DatasetError:
         mine = False
     if not mine:
-        raise UsageError(f"{folder} was given to another dataset while this one was made; choose another --out")
+        raise UsageError(f"{folder} was given to another dataset while this one was made; choose another out=")
 
 
 def is_dataset(folder: Path) -> bool:
@@ -176,9 +176,9 @@ def _refusal(found: Blueprint, wanted: Blueprint) -> str:
     if not changed:
         return (
             f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; a dataset does not grow or shrink,"
-            " but the rows that both sizes have are the same: choose another --out, or replace it with --force"
+            " but the rows that both sizes have are the same: choose another out=, or replace it with force=True"
         )
-    return f"holds another dataset ({'; '.join([*changed][:3])}); choose another --out, or replace it with --force"
+    return f"holds another dataset ({'; '.join([*changed][:3])}); choose another out=, or replace it with force=True"
 
 
 def _setting(difference: Difference) -> str:
@@ -241,7 +241,7 @@ def check_clearable(workspace: Workspace) -> list[Path]:
 
 
 def _foreign(folder: Path, splits: list[Path]) -> Path | None:
-    """Return a file that --force must not delete and that would be in the way, if there is one."""
+    """Return a file that force=True must not delete and that would be in the way, if there is one."""
     known = {*_SUMMARIES, PLAN, WORK, *(split.name for split in splits)}
     candidates = [path for path in folder.iterdir() if path.name not in known]
     for split in splits:

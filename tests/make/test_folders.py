@@ -40,7 +40,7 @@ def test_another_dataset_in_the_folder_is_refused_and_not_touched(folder, what):
         pytest.skip("this is the only backend here")
     before = snapshot(folder)
     words = what.replace("_", " ")
-    with pytest.raises(UsageError, match=f"holds another dataset .*{words} .* instead of .*--force"):
+    with pytest.raises(UsageError, match=f"holds another dataset .*{words} .* instead of .*force=True"):
         make_tiny(folder, **CHANGES[what])
     assert snapshot(folder) == before
 
@@ -75,7 +75,7 @@ def test_another_size_is_refused_with_what_can_be_done(folder, rows):
     text = str(caught.value)
     assert "holds this dataset with 660 rows (train 600, validation 60), not with" in text
     assert f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
-    assert "the rows that both sizes have are the same: choose another --out, or replace it with --force" in text
+    assert "the rows that both sizes have are the same: choose another out=, or replace it with force=True" in text
     assert snapshot(folder) == before
 
 
@@ -134,7 +134,7 @@ def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, con
     else:
         (folder / "plan.json").write_bytes(content)
     before = snapshot(folder)
-    with pytest.raises(DatasetError, match=r"plan.json is damaged: .*; --force replaces the whole dataset"):
+    with pytest.raises(DatasetError, match=r"plan.json is damaged: .*; force=True replaces the whole dataset"):
         make_tiny(folder)
     assert snapshot(folder) == before
     assert make_tiny(folder, force=True).complete
@@ -151,7 +151,7 @@ def test_force_works_where_the_blueprint_is_damaged_and_a_record_or_all_document
 
 def test_force_works_where_the_blueprint_is_lost(folder):
     (folder / "plan.json").unlink()
-    with pytest.raises(DatasetError, match=r"plan.json is missing; --force replaces the whole dataset"):
+    with pytest.raises(DatasetError, match=r"plan.json is missing; force=True replaces the whole dataset"):
         make_tiny(folder)
     assert make_tiny(folder, force=True).complete
     assert validate_dataset(folder).ok
@@ -171,7 +171,7 @@ def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force,
     if blueprint is not None:
         (tmp_path / "plan.json").write_text(blueprint)
     before = snapshot(tmp_path)
-    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another --out"):
+    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another out="):
         make_tiny(tmp_path, force=force)
     assert snapshot(tmp_path) == before
 
@@ -236,8 +236,8 @@ def test_a_place_where_no_folder_can_be_is_one_line_with_what_to_do(tmp_path, ca
     (tmp_path / "file").write_text("mine")
     expected = {
         "": (2, "out must name a folder, got ''"),
-        str(tmp_path / "file"): (2, "file is a file, not a folder; choose another --out"),
-        str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another --out"),
+        str(tmp_path / "file"): (2, "file is a file, not a folder; choose another out="),
+        str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another out="),
         str(tmp_path / ("x" * 300)): (3, "File name too long; choose a shorter name"),
     }
     for out, (code, text) in expected.items():

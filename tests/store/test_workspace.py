@@ -58,7 +58,7 @@ def test_another_blueprint_takes_a_folder_without_rows_only(tmp_path: Path) -> N
     open_workspace(tmp_path, BLUEPRINT)
     assert open_workspace(tmp_path, OTHER) == OTHER
     make_shard(tmp_path, OTHER, shards(OTHER)[0])
-    with pytest.raises(UsageError, match=r"holds another dataset \(seed 8 instead of \d+\); choose another --out"):
+    with pytest.raises(UsageError, match=r"holds another dataset \(seed 8 instead of \d+\); choose another out="):
         open_workspace(tmp_path, BLUEPRINT)
     assert load_blueprint(tmp_path) == OTHER
     assert open_workspace(tmp_path, BLUEPRINT, force=True) == BLUEPRINT
