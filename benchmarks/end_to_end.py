@@ -27,13 +27,17 @@ STEPS = (  # what happens before the first row
     ("cnpgen.make.dataset", "import cnpgen.make.dataset"),
     ("recipe", "from cnpgen.make.load import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
     ("Pinocchio, Coal", "import pinocchio, coal"),
-    ("kernels, plan", "cnpgen.make.dataset.draw_up(recipe, {out!r})"),
+    (
+        "kernels, blueprint",
+        "from pathlib import Path; place = cnpgen.make.dataset.find_workspace(Path({out!r}));"
+        " cnpgen.make.dataset.draw_up(recipe, place)",
+    ),
     ("h5py", "import h5py"),
     ("joblib", "from joblib import Parallel, delayed"),
     ("2 workers", "Parallel(n_jobs=2)(delayed(abs)(i) for i in range(2))"),
     (
         "cnpgen in workers",
-        "Parallel(n_jobs=2)(delayed(cnpgen.make.dataset.draw_up)(recipe, {out!r}) for i in range(2))",
+        "Parallel(n_jobs=2)(delayed(cnpgen.make.dataset.draw_up)(recipe, place) for i in range(2))",
     ),
 )
 

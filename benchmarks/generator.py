@@ -41,12 +41,12 @@ class StageTime:
     def timed(self, run: Work) -> Work:
         """Wrap the stage's function."""
 
-        def timed(batch: Round, random: Any) -> None:
-            self.entered += len(batch.alive)
+        def timed(draws: Round, random: Any) -> None:
+            self.entered += len(draws.alive)
             start = time.process_time()
-            run(batch, random)
+            run(draws, random)
             self.seconds += time.process_time() - start
-            self.left += len(batch.alive)
+            self.left += len(draws.alive)
 
         return timed
 
@@ -82,7 +82,7 @@ class Case:
         """Make fresh blocks; return the CPU time [s] and the number of draws."""
         start, drawn = time.process_time(), 0
         for _ in range(blocks):
-            drawn += self.prepared.block(1, "benchmark", self.next_block).outcome.tried
+            drawn += self.prepared.block(1, "benchmark", self.next_block).fates.tried
             self.next_block += 1
         return time.process_time() - start, drawn
 

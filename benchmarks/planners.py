@@ -103,14 +103,14 @@ def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, A
     """Plan anew from points on valid plans, to the same goal and to another one."""
     planner = Planner(name)
     plans = planner.plan_batch(draw_problems(name, planned, seed=seed).boundary)
-    plans, found = plans.select(evaluate_plans(plans).valid), []
+    plans, found = plans[evaluate_plans(plans).valid], []
     others = np.roll(np.arange(len(plans)), 1)
     for goal, ends in (("same", plans.boundary), ("another", plans.boundary[others])):
         for when in WHEN:
             progress(f"{name}: {len(plans)} plans replanned at {when:g} T to {goal} goal")
             new = planner.replan(plans, when * plans.duration, goal_q=ends.goal_q, goal_dq=ends.goal_dq)
             facts = {"goal": goal, "at": when, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
-            facts["refined valid"] = float(refine_plans(new.select(slice(refined))).valid.mean())
+            facts["refined valid"] = float(refine_plans(new[:refined]).valid.mean())
             facts["T / left"] = float(new.duration.mean() / ((1 - when) * plans.duration.mean()))
             found.append(facts)
     return found
@@ -147,7 +147,7 @@ def measure(name: str, seed: int, planned: int, refined: int) -> dict[str, float
     planner = Planner(name)
     given = draw_problems(name, max(planned, refined), seed=seed)
     plans = planner.plan_batch(given.boundary)
-    return {**judge(plans.select(slice(planned))), **refine(plans.select(slice(refined)))}
+    return {**judge(plans[:planned]), **refine(plans[:refined])}
 
 
 def rows_of(name: str, found: dict[str, float]) -> list[tuple[str, ...]]:

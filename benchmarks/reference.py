@@ -92,9 +92,9 @@ def our_rows(prepared: PreparedPipeline, samples: int, seed: int) -> Round:
     """Run rounds of draws until one has enough rows; it also holds the columns that are not stored, such as guesses."""
     size = max(256, 3 * samples)
     while True:
-        batch = prepared._round(random_generator(seed, "reference", 0), size)
-        if len(batch.alive) >= samples:
-            return batch
+        draws = prepared._round(random_generator(seed, "reference", 0), size)
+        if len(draws.alive) >= samples:
+            return draws
         size *= 2
 
 
@@ -111,11 +111,11 @@ def our_seconds(prepared: PreparedPipeline, repeat: int = 9) -> float:
 
 def compare_replan(prepared: PreparedPipeline, samples: int, seed: int, starts: int) -> Comparison:
     """Solve rows of airhockey-replan again."""
-    arm, batch, watch = Arm(prepared.context.robot), our_rows(prepared, samples, seed), Watch()
+    arm, draws, watch = Arm(prepared.context.robot), our_rows(prepared, samples, seed), Watch()
     found = Comparison("airhockey-replan", samples, our_seconds(prepared))
     random = np.random.default_rng(seed)
     for row in range(samples):
-        sample = {name: np.ascontiguousarray(values[:, row]) for name, values in batch.columns.items()}
+        sample = {name: np.ascontiguousarray(values[:, row]) for name, values in draws.columns.items()}
         angle = float(sample["hit_angle"][0])
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         _reference_start(arm, sample, found, watch=watch, random=random)
@@ -183,13 +183,13 @@ def _nearby(arm: Arm, hit: Hit, random: np.random.Generator) -> Array:
 
 def compare_heavy(prepared: PreparedPipeline, samples: int, seed: int) -> Comparison:
     """Solve rows of heavy-object again."""
-    arm, batch, watch = Arm(prepared.context.robot), our_rows(prepared, samples, seed), Watch()
+    arm, draws, watch = Arm(prepared.context.robot), our_rows(prepared, samples, seed), Watch()
     problem = prepared.context.problem
     boxes, zero = Boxes(problem, arm), np.zeros(arm.robot.n)
     half = problem.object.size[2] / 2 if problem.object else 0.0
     found = Comparison("heavy-object", samples, our_seconds(prepared))
     for row in range(samples):
-        sample = {name: np.ascontiguousarray(values[:, row]) for name, values in batch.columns.items()}
+        sample = {name: np.ascontiguousarray(values[:, row]) for name, values in draws.columns.items()}
         tops = np.array([sample[f"{box.below}_xyz"][2] - half for box in problem.obstacle])
         guess = sample["guess_q"]
         for end in ("start", "goal"):

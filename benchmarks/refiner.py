@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
+from ipopt import with_ipopt
 from refiner_problems import Made, grid_of_hits, like_a_networks, make_each
 from slsqp import minimise_slsqp
 
@@ -101,7 +102,8 @@ def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     for name in PIPELINES:
         progress(f"{name} with ipopt")
         problems = draw_problems(name, sizes["ipopt"], seed=options.seed + 1)
-        own, other = (make_each(problems, RefineOptions(solver=solver)) for solver in ("own", "ipopt"))
+        tool = prepare(problems, RefineOptions())
+        own, other = (make_each(problems, RefineOptions(), each) for each in (tool, with_ipopt(tool)))
         both = [index for index in range(len(own)) if own[index].valid and other[index].valid]
         times = np.array([own[i].duration / other[i].duration for i in both])
         costs = np.array([own[i].refined.cost / other[i].refined.cost for i in both])

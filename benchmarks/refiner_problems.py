@@ -98,17 +98,17 @@ def grid_of_hits() -> Plans:
     context = PreparedPipeline(pipeline, backend=backend, cache_folder=cache_folder).context
     puck = np.stack(np.meshgrid(PUCKS_X, PUCKS_Y, indexing="ij")).reshape(2, -1)
     along = (GOAL[:, None] - puck) / np.linalg.norm(GOAL[:, None] - puck, axis=0)
-    batch, base = Round(puck.shape[1]), context.robot.base
+    draws, base = Round(puck.shape[1]), context.robot.base
     height = next(each.z for each in context.problem.constraint if hasattr(each, "start_band"))
-    batch["goal_xyz"] = np.vstack([puck - BEHIND * along, np.full(batch.size, height)])
-    batch["hit_angle"] = np.arctan2(along[1], along[0])[None]
+    draws["goal_xyz"] = np.vstack([puck - BEHIND * along, np.full(draws.size, height)])
+    draws["hit_angle"] = np.arctan2(along[1], along[0])[None]
     for stage in (HittingConfiguration(near="base"), HittingVelocity(full_speed=1.0)):
-        stage.prepare(context)(batch, np.random.default_rng(0))
-    assert not batch.reasons or len(batch.alive) == batch.size
-    columns = {name: values.T for name, values in batch.columns.items()}
-    still = np.zeros((batch.size, context.robot.n))
+        stage.prepare(context)(draws, np.random.default_rng(0))
+    assert not draws.reasons or len(draws.alive) == draws.size
+    columns = {name: values.T for name, values in draws.columns.items()}
+    still = np.zeros((draws.size, context.robot.n))
     start = {"start_q": still + base, "start_dq": still, "start_ddq": still}
-    start["start_xyz"] = np.tile(Arm(context.robot).at(base).position, (batch.size, 1))
+    start["start_xyz"] = np.tile(Arm(context.robot).at(base).position, (draws.size, 1))
     columns |= {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed", "hit_speed_max")}
     return problems_of_rows(record_problem(context.problem), {**columns, **start})
 

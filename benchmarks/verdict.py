@@ -83,7 +83,7 @@ def state_by_state(plans: Plans) -> tuple[list[dict[str, float]], float]:
 
 def measure(plans: Plans, *, repeat: int, slow: int) -> Timing:
     """Measure one file."""
-    few = plans.select(slice(slow))
+    few = plans[:slow]
     verdicts, _ = judged(plans)  # warms up, too
     times = [judged(plans)[1] / len(plans) for _ in range(repeat)]
     ratios, difference = [], 0.0

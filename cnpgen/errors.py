@@ -53,8 +53,16 @@ class MachineError(CnpgenError):
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ``" (did you mean 'x'?)"`` for the known name nearest to ``name``, or an empty string."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    names = list(known)
+    begun = [each for each in names if len(name) > 2 and each.startswith(name)]
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5) or begun
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def lacks(noun: str, name: str, known: Iterable[str]) -> str:
+    """Say that something is not among what there is: ``"has no split 'x', only train, test"``."""
+    names = list(known)
+    return f"has no {noun} {name!r}{nearest(name, names)}, only {', '.join(names) or 'none'}"
 
 
 def counted(number: int, noun: str) -> str:

@@ -85,12 +85,12 @@ def kernels_of(cache_folder: Path) -> Callable[..., KernelLibrary]:
 
 def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> Round:
     """Run one round of draws through the stages, up to and including the first one of class ``until``."""
-    batch, random = Round(size), random_generator(seed, "train", 0)
+    draws, random = Round(size), random_generator(seed, "train", 0)
     for stage in prepared.pipeline.stage:
-        stage.prepare(prepared.context)(batch, random)
+        stage.prepare(prepared.context)(draws, random)
         if type(stage).__name__ == until:
             break
-    return batch
+    return draws
 
 
 class Arm:
@@ -163,7 +163,7 @@ def columns_of(folder: Path, split: str = "train") -> dict[str, np.ndarray]:
     """Read all rows of a split."""
     from cnpgen.store.reader import open_dataset
 
-    return open_dataset(folder, allow_partial=True).read(split)
+    return open_dataset(folder, allow_incomplete=True).read(split)
 
 
 @pytest.fixture

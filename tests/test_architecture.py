@@ -1,71 +1,60 @@
-"""Dependencies point one way, nothing heavy is imported before it is needed, and the rim is where effects are."""
+"""Rooms import rooms of lower floors only, judges stand apart, nothing heavy is imported before it is needed."""
 
 import ast
 import subprocess
 import sys
 from graphlib import TopologicalSorter
-from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
-# Layers from the top of docs/architecture.md downwards; a module may import those of its own layer and above.
-LAYERS = (
-    ("errors", "units", "fields", "outcome", "wording", "threads", "arguments", "signals"),
-    ("workers",),
-    ("schema", "parsing"),
-    ("constraints", "pipelines.stage"),
-    ("plugins",),
-    ("recipes", "recipe_files", "recipe_checks", "library", "data_card"),
-    ("robots",),
-    ("kernels",),
-    ("pipelines",),
-    ("store", "trajectory", "verify"),
-    ("verdict", "plans", "losses", "refine", "loader", "export", "plan_plots"),
-    ("certification",),
-    ("network", "planner"),
-    ("interop",),
-    ("make_shard", "make_plan", "make"),
-    ("consistency", "shard_checks", "deep_check", "regeneration"),
-    ("validation", "inspection", "describe", "plots", "doctor"),
-    ("evaluation", "refinement", "solving"),
-    ("training",),
-    ("cli", "__main__", "__init__"),
+# Floors of rooms, the ground first, as docs/architecture.md has them: a room imports rooms of the floors below only.
+FLOORS = (
+    ("errors",),
+    ("schema", "store"),
+    ("machine", "robots", "trajectory", "kernels", "loader"),
+    ("symbolic", "world"),
+    ("problems",),
+    ("pipelines", "judges", "losses"),
+    ("plans", "plugins"),
+    ("refine", "planner"),
+    ("make", "training", "interop"),
+    ("validate",),
+    ("cli", "__init__"),
+    ("__main__",),
 )
-# What a part must not import although a layer above it may be older: the judges share no code with what they judge.
-APART = {
-    "store": ("kernels", "pipelines", "robots", "refine"),
-    "loader": ("kernels", "pipelines", "robots", "refine", "verify", "recipes", "trajectory"),
-    "verify": ("kernels", "pipelines", "refine", "robots.symbolic", "robots.linalg", "robots.boxes"),
-    "verdict": ("kernels", "pipelines", "refine", "robots.symbolic", "robots.linalg", "robots.boxes"),
-    "trajectory": ("kernels", "pipelines", "robots", "refine", "verify"),
-}
+# What a room must not import although it stands on a floor below: judges share no code with what they judge.
+SOLVERS = ("symbolic", "kernels", "pipelines", "losses", "refine", "planner")
+APART = {"judges": SOLVERS, "world": SOLVERS}
 HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp")
 FRAMEWORKS = ("torch", "jax", "tensorflow")
+BRIDGES = ("interop.tensorflow",)  # those of one file; users import them
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if "_recipes" not in path.parts
 )
 
 
 def name(module: Path) -> str:
+    """Dotted name of a module, without the package's: "store.files.atomic", "store" for its __init__."""
     parts = module.parts[:-1] if module.name == "__init__" and len(module.parts) > 1 else module.parts
     return ".".join(parts)
 
 
-def layer(module: str) -> int:
-    best = max((prefix for row in LAYERS for prefix in row if within(module, prefix)), key=len, default=None)
-    assert best is not None, f"cnpgen.{module} is in no layer of docs/architecture.md"
-    return next(index for index, row in enumerate(LAYERS) if best in row)
+def room(module: str) -> str:
+    return module.partition(".")[0]
 
 
-def within(module: str, prefix: str) -> bool:
-    return module == prefix or module.startswith(prefix + ".")
+def floor(module: str) -> int:
+    found = [index for index, rooms in enumerate(FLOORS) if room(module) in rooms]
+    assert len(found) == 1, f"the room {room(module)!r} is on {len(found)} floors of docs/architecture.md, expected one"
+    return found[0]
 
 
-def imports(module: Path, *, everywhere: bool = True) -> set[str]:
-    """Names that a module imports at run time: at its top, or also inside functions."""
+def imports(module: Path, *, everywhere: bool = True, typing: bool = True) -> set[str]:
+    """Names that a module imports: at its top, or also inside functions, for type checkers only or not."""
     tree = ast.parse((PACKAGE / module).with_suffix(".py").read_text(encoding="utf-8"))
     nodes = ast.walk(tree) if everywhere else iter(tree.body)
     typing_only = {
@@ -76,54 +65,90 @@ def imports(module: Path, *, everywhere: bool = True) -> set[str]:
     }
     found: set[str] = set()
     for node in nodes:
-        if id(node) in typing_only:
+        if id(node) in typing_only and not typing:
             continue
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module)
-            if node.module == "cnpgen":
-                found.update(f"cnpgen.{alias.name}" for alias in node.names)
+            if node.module.partition(".")[0] == "cnpgen":
+                found.update(f"{node.module}.{alias.name}" for alias in node.names)
     return found
 
 
+NAMES = {name(module): module for module in MODULES}
+
+
+def modules_of(imported: set[str]) -> set[str]:
+    """The package's own modules among imported names."""
+    return {target for target in (item.removeprefix("cnpgen.") for item in imported) if target in NAMES}
+
+
 @pytest.mark.parametrize("module", MODULES, ids=name)
-def test_a_module_imports_only_its_own_layer_and_those_above(module: Path) -> None:
-    own = layer(name(module))
-    for imported in imports(module):
-        target = imported.removeprefix("cnpgen.")
-        if (
-            imported.startswith("cnpgen.")
-            and (PACKAGE / target.split(".")[0]).with_suffix(".py").exists() | (PACKAGE / target.split(".")[0]).is_dir()
-        ):
-            if within(name(module), "constraints") and target == "robots.boxes":
-                continue  # the symbolic form of a constraint, built only where kernels are
-            assert layer(target) <= own, f"cnpgen.{name(module)} imports cnpgen.{target} of a later layer"
+def test_a_module_imports_its_own_room_and_those_of_lower_floors(module: Path) -> None:
+    own = name(module)
+    for target in modules_of(imports(module)):
+        assert room(target) == room(own) or floor(target) < floor(own), (
+            f"cnpgen.{own} imports cnpgen.{target}, which is not on a lower floor"
+        )
 
 
-def test_the_layers_of_the_docs_are_these() -> None:
+def test_every_room_is_named_in_the_docs_on_its_floor() -> None:
     page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
     block = page.split("## Who may import whom")[1].split("```")[1]
-    lines = [line.split("  ")[0].split(", ") for line in block.splitlines() if line.strip() and line[0] != " "]
-    named = [module for line in lines for module in line]
-    assert {*named, "__main__", "__init__"} == {module for row in LAYERS for module in row}
-    for above, below in pairwise(lines):
-        assert max(map(layer, above)) <= min(map(layer, below)), f"{above} stand above {below}"
+    floors = tuple(tuple(line.split("  ")[0].split(", ")) for line in block.splitlines() if line.strip())
+    assert floors == FLOORS
+    assert {each for row in FLOORS for each in row} == {room(module) for module in NAMES}
+
+
+def test_the_picture_shows_every_room_above_those_that_it_may_import() -> None:
+    picture = ElementTree.parse(PACKAGE.parent / "docs" / "images" / "house.svg")
+    texts = [text for text in picture.iter("{http://www.w3.org/2000/svg}text") if text.get("class") == "n"]
+    heights = {str(text.text): float(text.get("y", "nan")) for text in texts}
+    assert heights.pop("cnpgen") < min(heights.values())  # the roof
+    drawn = [{each for each, y in heights.items() if y == height} for height in sorted(set(heights.values()))]
+    assert drawn == [set(row) for row in reversed(FLOORS)]
+
+
+def test_no_module_imports_itself_in_a_circle_not_even_for_types() -> None:
+    graph = {own: modules_of(imports(module)) - {own} for own, module in NAMES.items()}
+    order = list(TopologicalSorter(graph).static_order())  # raises CycleError
+    assert set(order) == set(graph)
 
 
 @pytest.mark.parametrize("part", APART)
 def test_a_judge_shares_no_code_with_what_it_judges(part: str) -> None:
-    for module in MODULES:
-        if within(name(module), part):
-            for imported in imports(module):
-                target = imported.removeprefix("cnpgen.")
-                allowed = (
-                    target in {"pipelines.stage", "robots.robot", "robots.obstacles", "robots.chain"}
-                    and part != "store"
-                )
-                assert allowed or not any(within(target, apart) for apart in APART[part]), (
-                    f"{name(module)} imports {target}"
-                )
+    for own, module in NAMES.items():
+        if room(own) == part:
+            shared = {target for target in modules_of(imports(module)) if room(target) in APART[part]}
+            assert not shared, f"cnpgen.{own} imports {shared}"
+
+
+def test_the_symbolic_form_of_a_constraint_is_built_only_where_it_is_asked_for() -> None:
+    for own, module in NAMES.items():
+        if room(own) == "problems":
+            loaded = modules_of(imports(module, everywhere=False, typing=False))
+            assert not {target for target in loaded if room(target) in {"symbolic", "world"}}, own
+
+
+def test_every_file_has_a_reader() -> None:
+    """What nothing imports is left over; kinds are found by their names, and faces and bridges are for users."""
+    used = {target for module in MODULES for target in modules_of(imports(module))} | modules_of(public_modules())
+    by_name = {value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()}
+    left = {own for own, module in NAMES.items() if own not in used | by_name and module.name != "__init__"}
+    assert left <= {"__main__", "plugins", *BRIDGES}
+
+
+def public_modules() -> set[str]:
+    """The modules of the names that users type, as the package's stub lists them."""
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    return {str(node.module) for node in stub.body if isinstance(node, ast.ImportFrom)}
+
+
+def kinds_by_name() -> set[str]:
+    from cnpgen.schema import registry
+
+    return {spec for group in registry.BUILT_IN.values() for spec in group.values()}
 
 
 @pytest.mark.parametrize("module", MODULES, ids=name)
@@ -135,7 +160,7 @@ def test_no_module_imports_a_heavy_library_at_its_top(module: Path) -> None:
 def test_only_the_bridge_of_a_framework_imports_it() -> None:
     for module in MODULES:
         found = {imported.split(".")[0] for imported in imports(module)} & set(FRAMEWORKS)
-        own = {framework for framework in FRAMEWORKS if within(name(module), f"interop.{framework}")}
+        own = set(name(module).split(".")[1:2]) if room(name(module)) == "interop" else set()
         assert found <= own, f"{name(module)} imports {found}"
 
 
@@ -146,18 +171,6 @@ def test_importing_recipes_or_listing_them_loads_nothing_heavy(statement: str) -
     code = f"{statement}\nimport sys\nprint('LOADED', *sorted(set({(*HEAVY, *FRAMEWORKS)!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "LOADED"
-
-
-def modules_of(imported: set[str]) -> set[str]:
-    """The package's own modules among imported names."""
-    known = {name(module) for module in MODULES}
-    return {target for target in (item.removeprefix("cnpgen.") for item in imported) if target in known}
-
-
-def test_no_module_imports_itself_in_a_circle_not_even_inside_functions() -> None:
-    graph = {name(module): modules_of(imports(module)) - {name(module)} for module in MODULES}
-    order = list(TopologicalSorter(graph).static_order())  # raises CycleError
-    assert set(order) == set(graph)
 
 
 def python(code: str) -> str:
@@ -194,7 +207,7 @@ robot = load_robot(problem)
 zero = np.zeros((1, robot.n))
 fields = {"start_q": zero, "start_dq": zero, "start_ddq": zero, "goal_q": zero, "goal_dq": zero}
 verify_rows(problem, robot, {**fields, "start_xyz": np.ones((1, 3)), "goal_xyz": np.ones((1, 3))})
-apart = ("cnpgen.kernels", "cnpgen.pipelines.", "cnpgen.symbolic.state", "cnpgen.symbolic.boxes", "casadi")
-print("LOADED", *sorted(m for m in sys.modules if m.startswith(apart) and m != "cnpgen.pipelines.stages.stage"))
+apart = ("cnpgen.kernels", "cnpgen.pipelines", "cnpgen.symbolic", "cnpgen.refine", "casadi")
+print("LOADED", *sorted(m for m in sys.modules if m.startswith(apart)))
 """
     assert python(code) == "LOADED"

@@ -5,6 +5,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.shell import in_shell
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = check_machine()
     print(json.dumps(report.to_dict(), indent=2) if arguments.json else machine_text(report))
     for note in report.notes:
-        print(f"cnpgen: warning: {note}", file=sys.stderr)
+        print(f"cnpgen: warning: {in_shell(note, ('out', 'workers'))}", file=sys.stderr)
     for problem in report.problems:
         print(f"cnpgen: error: {problem}", file=sys.stderr)
     return 0 if report.ok else MachineError.exit_code

@@ -12,7 +12,6 @@ from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
-    from cnpgen.judges.plans import Verdict
     from cnpgen.plans.evaluate import Evaluation
 
 _TEXT = """\
@@ -101,7 +100,7 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     plans, chosen = found.plans, _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
     tops = obstacle_tops(problem, plans.columns["start_xyz"][chosen], plans.columns["goal_xyz"][chosen])
-    note = f"sample {plans.sample_id[chosen]}: {_said(found.verdicts[chosen])}"
+    note = f"sample {plans.sample_id[chosen]}: {found.verdicts[chosen]}"
     plot_plan(problem, robot, plans.motion, chosen, picture, tops=tops, note=note)
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
 
@@ -114,7 +113,3 @@ def _chosen(found: "Evaluation") -> int:
     if not able:
         raise DatasetError("none of the plans can be drawn: none can be evaluated")
     return next((index for index in able if not found.verdicts[index].valid), able[0])
-
-
-def _said(verdict: "Verdict") -> str:
-    return "valid" if verdict.valid else verdict.reason + (f" ({verdict.worst})" if verdict.worst else "")

@@ -9,9 +9,9 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
 if TYPE_CHECKING:
+    from cnpgen.store.fates import Fates
     from cnpgen.store.field import Field
     from cnpgen.store.inspection import Inspection
-    from cnpgen.store.outcome import Fates
     from cnpgen.store.statistics import FieldStatistics
 
 
@@ -54,8 +54,8 @@ def inspection_text(found: "Inspection") -> str:
     sections = [
         [f"{blueprint.name} {blueprint.version}  {blueprint.title}".rstrip(), *table(_facts(found), indent="  ")]
     ]
-    if found.outcome.tried:
-        sections.append(_yield_lines(found.outcome))
+    if found.fates.tried:
+        sections.append(_yield_lines(found.fates))
     head = ("field", "column", "unit", "min", "mean", "max")
     rows = [row for field in blueprint.fields for row in _field_rows(field, found.statistics.get(field.name))]
     sections.append(table([(*row, "") for row in (head, *rows)], indent="  ", right=(3, 4, 5)))
@@ -83,22 +83,22 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
     ]
 
 
-def _yield_lines(outcome: "Fates") -> list[str]:
+def _yield_lines(fates: "Fates") -> list[str]:
     """Lay out the fates of the draws, in pipeline order."""
     from cnpgen.cli.describe import table
 
-    rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{outcome.tried:,}", "", "100.00 %")]
-    left, before = outcome.tried, ""
-    for reason, count in outcome.rejections.items():
-        stage = outcome.stages.get(reason, "")
+    rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{fates.tried:,}", "", "100.00 %")]
+    left, before = fates.tried, ""
+    for reason, count in fates.rejections.items():
+        stage = fates.stages.get(reason, "")
         accepts = 100 * (1 - count / left) if left else 100.0
         left -= count
         label = stage if stage != before else ""
-        rows.append((label, reason, f"{count:,}", f"{accepts:.2f} %", f"{100 * left / outcome.tried:.2f} %"))
+        rows.append((label, reason, f"{count:,}", f"{accepts:.2f} %", f"{100 * left / fates.tried:.2f} %"))
         before = stage
-    share = f"{100 * outcome.accepted / outcome.tried:.2f} %"
+    share = f"{100 * fates.accepted / fates.tried:.2f} %"
     lines = table([(*row, "") for row in rows], indent="  ", right=(2, 3, 4))
-    return [f"  {outcome.accepted:,} of {outcome.tried:,} draws accepted, {share}", *lines]
+    return [f"  {fates.accepted:,} of {fates.tried:,} draws accepted, {share}", *lines]
 
 
 def _field_rows(field: "Field", found: "FieldStatistics | None") -> list[tuple[str, ...]]:

@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -27,6 +27,7 @@ from cnpgen.cli import (
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
+from cnpgen.cli.shell import in_shell
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
 from cnpgen.machine.threads import prefer_one_thread
 
@@ -96,27 +97,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit code, as ``cnpgen --help`` lists them.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
     with _warnings_on_one_line():
         try:
             with interruptible():
-                code = _run(words)
+                code = _run(words, given)
             sys.stdout.flush()
         except BrokenPipeError:
             return _leave_pipe()
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the boundary of the process
             if "--debug" in words:
                 traceback.print_exc()
-            return _report(error)
+            return _report(error, vars(given))
     return code
 
 
-def _run(words: list[str]) -> int:
+def _run(words: list[str], given: argparse.Namespace) -> int:
+    """Run what the words ask for, and leave in ``given`` what they give."""
     parser = build_parser()
     try:
-        arguments, extras = parser.parse_known_args(words)
+        arguments, extras = parser.parse_known_args(words, given)
     except SystemExit:  # --help and --version have printed what they have to say
         return 0
     chosen: Parser = getattr(arguments, "parser", parser)
@@ -143,15 +145,15 @@ def build_parser() -> Parser:
     return parser
 
 
-def _report(error: BaseException) -> int:
-    """Print an error as one line per mistake; return its exit code."""
+def _report(error: BaseException, options: Container[str]) -> int:
+    """Print an error as one line per mistake, in the words of the command's options; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
         what = "terminated" if isinstance(error, Terminated) else "interrupted"
         print(f"cnpgen: {what}: {error}" if str(error) else f"cnpgen: {what}", file=sys.stderr)
         return exit_code(error)
     lines, code = _explain(error)
     for line in lines:
-        print(f"cnpgen: error: {line}", file=sys.stderr)
+        print(f"cnpgen: error: {in_shell(line, options)}", file=sys.stderr)
     return code
 
 

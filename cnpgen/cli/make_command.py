@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.interruption import raise_if_interrupted
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from cnpgen.make.dataset import MadeDataset
     from cnpgen.make.recipe import DatasetRecipe
-    from cnpgen.store.outcome import Fates
+    from cnpgen.store.fates import Fates
 
 KEPT = "finished shards are kept, run the same command again to go on"
 
@@ -75,9 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
             raise UsageError("--certify stores plans, which are exact in float64 only: leave out --dtype float32")
         recipe = certified(recipe)
     if arguments.dry_run:
-        from cnpgen.cli.dry_run import plan_text
+        from cnpgen.cli.dry_run import blueprint_text
 
-        print(plan_text(recipe, **_settings(arguments), force=arguments.force))
+        print(blueprint_text(recipe, **_settings(arguments), force=arguments.force))
         return 0
     try:
         _make(recipe, arguments)
@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(arguments: argparse.Namespace) -> dict[str, object]:
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments that decide what the dataset is."""
     return {name: getattr(arguments, name) for name in ("out", "n", "seed", "shard_size", "dtype", "backend")}
 
@@ -100,9 +100,9 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
         raise_if_interrupted()
         meter.begin(f"{step} {folder}", rows, there)
 
-    def count(rows: int, outcome: "Fates | None") -> None:
+    def count(rows: int, fates: "Fates | None") -> None:
         raise_if_interrupted()
-        meter(rows, outcome)
+        meter(rows, fates)
 
     try:
         made = make_dataset(
@@ -144,7 +144,7 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) ->
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
     lines = [f"made {share}{text} {times}{rest}"]
-    lines += [_yield(meter.outcome)] if meter.outcome else []
+    lines += [_yield(meter.fates)] if meter.fates else []
     return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
 
 
@@ -161,10 +161,10 @@ def _rows_text(rows: "Mapping[str, int]") -> str:
     return counted(sum(rows.values()), "row") + (f" ({splits})" if splits else "")
 
 
-def _yield(outcome: "Fates") -> str:
+def _yield(fates: "Fates") -> str:
     """Say how many draws were accepted and why most of the others were not."""
-    tried = max(outcome.tried, 1)
-    worst = sorted(outcome.rejections.items(), key=lambda item: -item[1])[:3]
+    tried = max(fates.tried, 1)
+    worst = sorted(fates.rejections.items(), key=lambda item: -item[1])[:3]
     reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count >= 5e-4 * tried)
-    text = f"accepted {outcome.accepted / tried:.1%} of {outcome.tried:,} draws"
+    text = f"accepted {fates.accepted / tried:.1%} of {fates.tried:,} draws"
     return f"{text}; rejected: {reasons}" if reasons else text

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
-    from cnpgen.store.outcome import Fates
+    from cnpgen.store.fates import Fates
 
 
 class Meter:
@@ -20,12 +20,12 @@ class Meter:
 
     Attributes:
         rows: Rows counted since the last beginning, without ``initial``.
-        outcome: The fates of their draws.
+        fates: The fates of their draws.
     """
 
     def __init__(self, *, quiet: bool = False, noun: str = "row") -> None:
         self.rows = 0
-        self.outcome: Fates | None = None
+        self.fates: Fates | None = None
         self._quiet, self._noun = quiet, noun
         self._start = self._begun = time.perf_counter()
         self._bar: Any = None
@@ -39,7 +39,7 @@ class Meter:
             initial: Rows that are there already.
         """
         self.close()
-        self.rows, self.outcome, self._begun = 0, None, time.perf_counter()
+        self.rows, self.fates, self._begun = 0, None, time.perf_counter()
         if not self._quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
@@ -66,15 +66,15 @@ class Meter:
         """Time since the last beginning [s]."""
         return time.perf_counter() - self._begun
 
-    def __call__(self, rows: int, outcome: "Fates | None" = None) -> None:
+    def __call__(self, rows: int, fates: "Fates | None" = None) -> None:
         """Count the rows of a shard."""
         self.rows += rows
-        if outcome is not None:
-            self.outcome = outcome if self.outcome is None else self.outcome.merge(outcome)
+        if fates is not None:
+            self.fates = fates if self.fates is None else self.fates.merge(fates)
         if self._bar is not None:
-            if self.outcome is not None:
-                tried = self._bar.format_sizeof(self.outcome.tried)
-                share = self.outcome.accepted / max(self.outcome.tried, 1)
+            if self.fates is not None:
+                tried = self._bar.format_sizeof(self.fates.tried)
+                share = self.fates.accepted / max(self.fates.tried, 1)
                 self._bar.set_postfix_str(f"{tried} tried, {share:.1%} accepted", refresh=False)
             self._bar.update(rows)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.plans import Refinement
 
-REFINING = ("objective", "weight", "solver", "max_iterations", "tolerance", "step")  # what add_refining adds
+REFINING = ("objective", "weight", "max_iterations", "tolerance", "step")  # what add_refining adds
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
@@ -52,7 +52,6 @@ def add_refining(parser: Options) -> None:
         help="what is minimised: time and what the problem file adds to it (default), or effort or jerk beside time",
     )
     option("--weight", metavar="X", type=float, help="of what is beside the time; default the problem's, 1 for others")
-    option("--solver", choices=("own", "ipopt", "sqpmethod"), default="own", help="own (default) or CasADi's")
     option("--max-iterations", metavar="I", type=values.natural, help="steps of the first pass (default: 40)")
     option(
         "--tolerance",

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from cnpgen.validate.dataset import ValidationReport
 
 _TEXT = """\
-Always checked: that every file is there, whole (sha256) and what the plan and the manifest say. --deep reads every row:
-constraints, positions, hits and their highest speeds, torque ratios, clearances, stored ranges, statistics, counts, and
-rows that stand there twice; of "attempts" only the sum per shard. Every row's attempts, the columns of plug-ins, and
-which draws became rows are for --regenerate to prove. It draws and solves blocks of 4096 rows again from the seed: with
-the backend, the kind of machine and the versions that made the dataset every bit is the same; elsewhere rows that agree
-to rounding (1e-9) are no finding.
+Always checked: that every file is there, whole (sha256) and what plan.json and the manifest say. --deep reads every
+row: constraints, positions, hits and their highest speeds, torque ratios, clearances, stored ranges, statistics,
+counts, and rows that stand there twice; of "attempts" only the sum per shard. Every row's attempts, the columns of
+plug-ins, and which draws became rows are for --regenerate to prove. It draws and solves blocks of 4096 rows again from
+the seed: with the backend, the kind of machine and the versions that made the dataset every bit is the same; elsewhere
+rows that agree to rounding (1e-9) are no finding.
 
 On stdout are the findings, one per line, as FILE: PROBLEM, and what was checked; with --quiet the findings only. A line
 that begins with "note:" is worth knowing and no finding. Of a certified dataset --deep judges the plans, too, as
@@ -78,7 +78,7 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
 
 
 def _rows(folder: Path) -> int:
-    """Return how many rows there are to compute again; 0 if the plan cannot say, which validation will report."""
+    """Return how many rows there are to compute again; 0 if plan.json cannot say, which validation will report."""
     from cnpgen.errors import DatasetError
     from cnpgen.store.blueprint import load_blueprint, shards
     from cnpgen.store.record import is_committed

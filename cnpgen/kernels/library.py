@@ -3,10 +3,9 @@
 import hashlib
 import inspect
 import json
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -24,6 +23,7 @@ from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.kernels.together import Compilers
 from cnpgen.schema.registry import package_digest
+from cnpgen.store.files.atomic import write_file
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
@@ -133,20 +133,9 @@ class KernelLibrary:
             return Tape.from_bytes(path.read_bytes())
         except (OSError, ValueError):
             tape = tape_from_function(builder(**given, **parameters), loop, grid=grid, dtype=dtype)
-            _store(path, tape.to_bytes())
+            with suppress(MachineError):  # a cache that cannot be written only costs time
+                write_file(path, tape.to_bytes())
             return tape
-
-
-def _store(path: Path, data: bytes) -> None:
-    """Write a cache entry atomically; a cache that cannot be written only costs time."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
-            built = Path(folder) / path.name
-            built.write_bytes(data)
-            built.replace(path)
-    except OSError:
-        return
 
 
 def _source_digests(builder: Callable[..., Any]) -> list[str]:

@@ -26,6 +26,9 @@ class Batch(Mapping[str, NDArray[Any]]):
     layout: Columns
     integers: Mapping[str, NDArray[Any]]
 
+    def __repr__(self) -> str:
+        return f"<batch of {self.rows} rows, {self.table.dtype}: {self.layout.summary}>"
+
     @property
     def columns(self) -> dict[str, slice]:
         """Field name -> its columns of the table."""

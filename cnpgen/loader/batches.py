@@ -1,6 +1,6 @@
 """The batches of a split, epoch by epoch, from any row on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +33,8 @@ class Batches:
 
     Attributes:
         times_set: How often the position was set since, by ``epoch`` or ``load_state``.
+        taken_elsewhere: Of whatever hands batches to other processes: whether those took some since the position was
+            last set, which is not seen here. ``state()`` asks.
 
     Raises:
         UsageError: There are fewer rows than one batch needs, or in the last batch than there are ranks.
@@ -48,9 +50,16 @@ class Batches:
         self._source, self._form, self._cut, self._position = source, form, cut, position
         self._kept: Kept | None = None
         self.times_set = 0
+        self.taken_elsewhere: list[Callable[[], bool]] = []
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_kept": None}
+        return self.__dict__ | {"_kept": None, "taken_elsewhere": []}
+
+    def __repr__(self) -> str:
+        source, position = self._source, self._position
+        where = f"seed {position.seed}, epoch {position.epoch}, row {position.row:,}"
+        rows = f"{self._cut.batch_size} of the {source.rows:,} rows of split {source.split!r}"
+        return f"<batches of {rows}, at {where}: {self._form.layout.summary}>"
 
     @property
     def epoch(self) -> int:
@@ -119,7 +128,7 @@ class Batches:
             batch: How many batches of that epoch were used.
 
         Raises:
-            UsageError: The epoch has not so many batches.
+            UsageError: The epoch has not so many batches; or workers took batches, and it is not said which were used.
         """
         position = self._position
         if epoch is not None or batch is not None:
@@ -129,6 +138,11 @@ class Batches:
             row = min(used * self._cut.batch_size, self._source.rows)
             epoch = position.epoch if epoch is None else integer("epoch", epoch, least=0)
             position = self._forward(replace(position, epoch=epoch, row=row))
+        elif any(taken() for taken in self.taken_elsewhere):
+            raise UsageError(
+                "the workers of a DataLoader took these batches, so that it is not known here how many were used: say"
+                " it with state(epoch=..., batch=...), or leave num_workers at 0"
+            )
         return position_to_json(position, self._source)
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -44,6 +44,11 @@ class Columns:
         return frozenset(field.name for field in self.fields if not field.width)
 
     @property
+    def summary(self) -> str:
+        """The fields in a few words, with their widths: ``"start_q[6], hit_speed"``."""
+        return ", ".join(f"{field.name}[{field.width}]" if field.width else field.name for field in self.fields)
+
+    @property
     def width(self) -> int:
         """Number of columns of the table."""
         return sum(max(field.width, 1) for field in self.floats)

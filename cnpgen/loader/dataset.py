@@ -4,20 +4,22 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from cnpgen.errors import DatasetError, nearest
+from cnpgen.errors import DatasetError, lacks
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.cut import Cut
 from cnpgen.loader.form import Form, make_form
+from cnpgen.loader.frame import make_frame
 from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
 from cnpgen.loader.shards import Shard, ShardReader, SplitShards
 from cnpgen.loader.split import Split
-from cnpgen.store.blueprint import Blueprint
+from cnpgen.store.blueprint import Blueprint, StoredProblem
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
 
@@ -59,6 +61,15 @@ class Dataset:
     def fields(self) -> dict[str, Field]:
         """Name -> what a field is: unit, names and limits of its columns, role."""
         return {field.name: field for field in self.blueprint.fields}
+
+    @property
+    def problem(self) -> StoredProblem:
+        """The problem whose motions the rows are the ends of, for ``PlanLoss(dataset.problem)`` and the like.
+
+        Raises:
+            DatasetError: The dataset does not say.
+        """
+        return self.blueprint.problem
 
     @cached_property
     def normalization(self) -> Normalization | None:
@@ -165,9 +176,28 @@ class Dataset:
         everything = np.arange(self._source(split).rows)
         return self.rows(split, everything, fields=fields, normalize=normalize, dtype=dtype)
 
+    def frame(self, split: str = "train", *, fields: Iterable[str] | None = None, library: str | None = None) -> Any:
+        """Read all rows of a split as a table of polars or pandas, a column per joint or axis: ``start_q.joint_1``.
+
+        Args:
+            split: Name of the split.
+            fields: Which fields.
+            library: "polars" or "pandas"; by default the one that is installed, polars if both are.
+
+        Returns:
+            A ``DataFrame``, in the fields' units. ``frame.attrs["units"]`` of pandas says column -> unit.
+
+        Raises:
+            DatasetError: There is no such split or field, or a shard is damaged.
+            UsageError: There is no such library.
+            MachineError: It is not installed.
+        """
+        rows = self.arrays(split, fields=fields)
+        return make_frame(rows, [self.fields[name] for name in rows], library=library)
+
     def _source(self, split: str) -> SplitShards:
         if split not in self.shards:
-            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(str(split), self.shards)}")
+            raise DatasetError(f"{self.folder} {lacks('split', str(split), self.shards)}")
         return SplitShards(split, self.shards[split], self.reader, self.fingerprint, self.blueprint.dtype)
 
     def _form(

@@ -1,4 +1,4 @@
-"""Opening a dataset for training: what is not whole is refused."""
+"""Opening a dataset: what is not whole is refused."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ Statistics = dict[str, dict[str, FieldStatistics]]
 
 
 def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: bool = True) -> Dataset:
-    """Open a dataset for training.
+    """Open a dataset: its rows in batches for training, as arrays or a table, one by one.
 
     That the shards are there and have their sizes is checked now; header and sha256 of each when it is first read.
 
@@ -36,9 +36,9 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
         MachineError: The system would not let us read something.
     """
     folder, verify = Path(folder), flag("verify", verify)
-    stored = open_dataset(folder, allow_partial=flag("allow_incomplete", allow_incomplete))
+    stored = open_dataset(folder, allow_incomplete=flag("allow_incomplete", allow_incomplete))
     if stored.manifest is None:
-        summary = summarise(folder, stored.blueprint, allow_partial=True)
+        summary = summarise(folder, stored.blueprint, allow_incomplete=True)
         shards, statistics = _recorded(folder, summary), summary.statistics
     else:
         shards, statistics = (

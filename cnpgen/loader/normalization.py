@@ -27,6 +27,9 @@ class Normalization:
     mean: Mapping[str, Floats]
     std: Mapping[str, Floats]
 
+    def __repr__(self) -> str:
+        return f"<means and deviations of {', '.join(self.mean)}>"
+
     @cached_property
     def scale(self) -> dict[str, Floats]:
         """Field name -> 1 / std, 0 for constant columns, shape (c,)."""

@@ -25,6 +25,9 @@ class Split:
     source: SplitShards
     form: Form
 
+    def __repr__(self) -> str:
+        return f"<{self.source.rows:,} rows of split {self.source.split!r}: {self.form.layout.summary}>"
+
     def __len__(self) -> int:
         return self.source.rows
 

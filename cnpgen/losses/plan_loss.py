@@ -1,6 +1,6 @@
 """The loss of plans with its gradient: integrals of the step losses over the phase."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError, nearest
+from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
@@ -19,8 +19,8 @@ from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.machine.threads import one_thread
-from cnpgen.problems.load import as_problem
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import flag, number, numbers
@@ -49,12 +49,16 @@ class LossValue:
     path_gradient: Array
     rate_gradient: Array
 
+    def __repr__(self) -> str:
+        return f"<LossValue of {counted(len(self.total), 'plan')}, {self.terms.shape[1]} terms>"
+
 
 class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
 
     Args:
-        problem: The problem, or its name or file.
+        problem: The problem, its record (``plans.problem``), or the name or the file of a problem, a pipeline or a
+            dataset.
         dtype: "float32" or "float64": what is computed with.
         nodes: Number of quadrature nodes.
         rule: Quadrature rule: "cosine" or "gauss".
@@ -75,7 +79,7 @@ class PlanLoss:
 
     def __init__(
         self,
-        problem: Problem | str | Path,
+        problem: Problem | ProblemRecord | str | Path,
         *,
         dtype: Dtype = "float32",
         nodes: int = 64,
@@ -108,7 +112,7 @@ class PlanLoss:
         path: ArrayLike,
         rate: ArrayLike,
         *,
-        weights: ArrayLike,
+        weights: ArrayLike | Mapping[str, float],
         tops: ArrayLike | None = None,
         start_tip: ArrayLike | None = None,
         shift: float = 0.0,
@@ -119,7 +123,8 @@ class PlanLoss:
         Args:
             path: Path control points [rad], shape (N, C, n).
             rate: Rate control points [1/s], shape (N, R), positive.
-            weights: Weight of every constraint term (e^alpha), shape (m,).
+            weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, where terms that are not
+                named keep the problem's, ``weights0``.
             tops: Heights of the obstacles' upper faces [m], shape (N, obstacles); needed where the problem has any.
             start_tip: Positions of the tip at the start [m], shape (N, 3): motions that start off the table are then
                 given the way to it that ``Constraint.funnel`` says; by default they must be on it at once.
@@ -127,7 +132,7 @@ class PlanLoss:
             gradient: Whether gradients are wanted; without, theirs are arrays of no plan, shape (0, C, n) and (0, R).
 
         Raises:
-            UsageError: A shape is wrong, something is no real number, or a weight is negative or not finite.
+            UsageError: A shape is wrong, something is no real number, or a weight is negative, infinite or of no term.
         """
         gradient, shift = flag("gradient", gradient), number("shift", shift)
         batch = check_batch(self.problem, path, rate, tops, start_tip, dtype=self.dtype)
@@ -190,13 +195,29 @@ class PlanLoss:
         self._check_count(shapes.pop("weights"))
         check_shapes(self.problem, shapes)
 
-    def checked_weights(self, weights: ArrayLike) -> Array:
-        """Return weights in the loss's precision.
+    def in_order(self, weights: ArrayLike | Mapping[str, float]) -> ArrayLike:
+        """Return weights by name in the order of the terms; others are returned as they are.
 
         Raises:
-            UsageError: The shape is wrong, or a weight is negative or not finite.
+            UsageError: There is no such term, or a weight is no finite number.
         """
-        given = numbers("weights", weights)
+        if not isinstance(weights, Mapping):
+            return weights
+        names = self.terms[1:]
+        unknown = next((name for name in weights if name not in names), None)
+        if unknown is not None:
+            hint = nearest(str(unknown), names)
+            raise UsageError(f"weights: there is no constraint {unknown!r}{hint}, expected some of {', '.join(names)}")
+        given = {name: number(f"the weight of {name!r}", weight) for name, weight in weights.items()}
+        return np.array([given.get(name, first) for name, first in zip(names, self.weights0, strict=True)])
+
+    def checked_weights(self, weights: ArrayLike | Mapping[str, float]) -> Array:
+        """Return weights in the order of the terms and in the loss's precision.
+
+        Raises:
+            UsageError: The shape is wrong, a weight is negative or not finite, or there is no such term.
+        """
+        given = numbers("weights", self.in_order(weights), differentiable=True)
         self._check_count(given.shape)
         for name, weight in zip(self.terms[1:], given.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:

@@ -1,23 +1,21 @@
-"""Planning datasets: everything that determines their bytes, resolved; nothing is made."""
+"""Drawing up the blueprint of a dataset: everything that determines its bytes, resolved; nothing is made."""
 
 import hashlib
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.load import as_dataset_recipe
-from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
+from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
 from cnpgen.make.shards import Job
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import Blueprint, default_shard_size, load_blueprint
+from cnpgen.store.blueprint import Blueprint, default_shard_size
+from cnpgen.store.workspace import Workspace
 
 MAX_ROWS = 10**12
-MAX_SEED = 2**63 - 1
-DTYPES = ("float64", "float32")
 
 
 def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
@@ -37,46 +35,51 @@ def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
 
 
 def draw_up(
-    recipe: str | Path | DatasetRecipe,
-    out: str | Path | None = None,
+    recipe: DatasetRecipe,
+    workspace: Workspace,
     *,
     n: int | None = None,
     seed: int | None = None,
     shard_size: int | None = None,
     dtype: str = "float64",
     backend: str | None = None,
-    resume: bool = False,
+    force: bool = False,
 ) -> Job:
     """Resolve what ``make_dataset`` would make, building its kernels but writing nothing of the dataset.
 
-    With ``resume``, backend and shard size that are not given are those with which the recipe was begun in the folder.
+    Args:
+        recipe: The recipe.
+        workspace: Its folder. If the recipe was begun there, backend and shard size that are not given are those with
+            which it was.
+        n: Rows over all splits; default the recipe's.
+        seed: Root seed; default the recipe's.
+        shard_size: Rows per shard.
+        dtype: What rows are stored as.
+        backend: What computes them; default the fastest that works.
+        force: Whether what was begun in the folder will be deleted.
 
     Raises:
         RecipeError: The recipe has mistakes.
         UsageError: An argument makes no sense.
         MachineError: No working backend.
     """
-    loaded = as_dataset_recipe(recipe)
-    _check(loaded, dtype)
-    total = integer("n", sum(loaded.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
-    root = integer("seed", loaded.seed if seed is None else seed, least=0, most=MAX_SEED)
-    folder = dataset_folder(loaded, out)
-    begun = _begun(folder, loaded) if resume else None
-    if begun is not None:
+    total, root, shard_size = _check(recipe, n, seed, shard_size)
+    digest, begun = recipe_digest(recipe), workspace.blueprint
+    if begun is not None and begun.recipe_sha256 == digest and not force:
         backend = begun.backend if backend is None else backend
         shard_size = begun.shard_size if shard_size is None else shard_size
     chosen, cache_folder = choose_backend(backend)
-    prepared = PreparedPipeline(loaded.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
+    prepared = PreparedPipeline(recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
     blueprint = Blueprint(
-        name=loaded.name,
-        version=loaded.version,
-        title=loaded.title,
-        license=loaded.license,
-        recipe_sha256=recipe_digest(loaded),
-        recipe=resolved(loaded),
+        name=recipe.name,
+        version=recipe.version,
+        title=recipe.title,
+        license=recipe.license,
+        recipe_sha256=digest,
+        recipe=resolved(recipe),
         seed=root,
-        splits=split_rows(loaded, total),
-        shard_size=_shard_size(shard_size, total, prepared.block_rows),
+        splits=split_rows(recipe, total),
+        shard_size=shard_size or default_shard_size(total, prepared.block_rows),
         block_rows=prepared.block_rows,
         dtype=dtype,
         backend=chosen,
@@ -84,31 +87,20 @@ def draw_up(
         robot=_robot_record(prepared),
         versions=versions(),
     )
-    return Job(folder, blueprint, loaded.pipeline, chosen, cache_folder)
+    return Job(workspace.folder, blueprint, recipe.pipeline, chosen, cache_folder)
 
 
-def _check(recipe: DatasetRecipe, dtype: str) -> None:
-    """Refuse what no file of a recipe can say, but a recipe that was made in Python."""
+def _check(
+    recipe: DatasetRecipe, n: int | None, seed: int | None, shard_size: int | None
+) -> tuple[int, int, int | None]:
+    """Return rows, seed and shard size; refuse what no file of a recipe can say, but a recipe made in Python."""
     for split, rows in recipe.splits.items():
         integer(f"the rows of split {split!r}", rows, least=1)
     if not recipe.splits:
         raise UsageError(f"{recipe.name} has no splits: expected rows of at least one, such as {{'train': 1000}}")
-    if dtype not in DTYPES:
-        raise UsageError(f"dtype must be {' or '.join(map(repr, DTYPES))}, got {dtype!r}")
-
-
-def _shard_size(wanted: int | None, rows: int, block_rows: int) -> int:
-    """Return the rows per shard."""
-    return default_shard_size(rows, block_rows) if wanted is None else integer("shard_size", wanted, least=1)
-
-
-def _begun(folder: Path, recipe: DatasetRecipe) -> Blueprint | None:
-    """Return the plan in a folder if it is one of the recipe; what else is there is not decided here."""
-    try:
-        found = load_blueprint(folder)
-    except DatasetError:
-        return None
-    return found if found.recipe_sha256 == recipe_digest(recipe) else None
+    total = integer("n", sum(recipe.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
+    root = integer("seed", recipe.seed if seed is None else seed, least=0, most=MAX_SEED)
+    return total, root, None if shard_size is None else integer("shard_size", shard_size, least=1)
 
 
 def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:

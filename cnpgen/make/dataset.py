@@ -1,4 +1,4 @@
-"""Making datasets: the plan, what is there already, sharing out the rest, the manifest."""
+"""Making datasets: the blueprint, what is there already, sharing out the rest, the manifest."""
 
 import operator
 import warnings
@@ -18,14 +18,14 @@ from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.shards import Job, make_shards
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, shards
 from cnpgen.store.check import check_documents
+from cnpgen.store.fates import Fates
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize, source_date
 from cnpgen.store.mending import discard, find_damaged, made_already
-from cnpgen.store.outcome import Fates
 from cnpgen.store.record import pending
-from cnpgen.store.workspace import check_place, clear_dataset, open_workspace
+from cnpgen.store.workspace import check_place, find_workspace, open_workspace
 
 ALONE = {
     "compiled": 200_000,
@@ -36,7 +36,7 @@ RUN_BLOCKS = 8  # blocks that a worker makes shards from before it is given othe
 RUNS = 4  # at least, for every worker, where there are enough blocks: so that none waits long for the last one
 
 Begin = Callable[[str, Path, int, int], None]  # called with "checking" or "making", the folder, the rows, those there
-Progress = Callable[[int, Fates | None], None]  # called with the rows of a shard and, where it was made, its outcome
+Progress = Callable[[int, Fates | None], None]  # called with the rows of a shard and, where it was made, its fates
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class MadeDataset:
 
     Attributes:
         folder: The dataset.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         made: Rows made by this call.
         complete: Whether every shard is there and the manifest is written.
         rows: Split -> rows that this call was about: all, or those of its part.
@@ -98,39 +98,33 @@ def make_dataset(
             finds all shards there finishes the dataset.
         begin: Called with ("checking", folder, rows that are there, 0) before rows are compared, if there are any, and
             with ("making", folder, rows that this call is about, rows of them that are there) before rows are made.
-        progress: Called with (rows, outcome) of every shard that was made, and (rows, None) of every one compared.
+        progress: Called with (rows, fates) of every shard that was made, and (rows, None) of every one compared.
 
     Raises:
         RecipeError: The recipe has mistakes, or its data card cannot be read.
         UsageError: An argument makes no sense, SOURCE_DATE_EPOCH does not, or the folder holds something else.
         MachineError: No working backend, a full disk, a dead worker; run again to go on.
-        DatasetError: The plan in the folder is damaged.
+        DatasetError: The plan.json in the folder is damaged.
     """
     _check(workers, part, force=force)
     loaded = as_dataset_recipe(recipe)
     loaded = certified(loaded) if certify else loaded
     notes = load_notes(loaded)
-    check_place(dataset_folder(loaded, out))
-    resume = not force
-    job = draw_up(loaded, out, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, resume=resume)
-    job = _opened(job, force=force)
-    mine = _part(shards(job.blueprint), part)
+    folder = dataset_folder(loaded, out)
+    workspace = find_workspace(folder)
+    check_place(workspace)
+    job = draw_up(loaded, workspace, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, force=force)
+    job = replace(job, blueprint=open_workspace(folder, job.blueprint, force=force))
+    tasks = shards(job.blueprint)
+    mine = _part(tasks, part)
     waiting, damaged = _take_stock(job, mine, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in mine)
-        begin("making", job.folder, rows, rows - sum(task.rows for task in waiting))
+        begin("making", folder, rows, rows - sum(task.rows for task in waiting))
     made = _make(job, waiting, workers, progress)
     complete, documents = _finish(job, notes, made=made, alone=part is None)
     rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.blueprint.splits}
-    return MadeDataset(job.folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
-
-
-def _opened(job: Job, *, force: bool) -> Job:
-    """Open the folder of a dataset; its plan is perhaps of another version, and shards say what the plan says."""
-    if force:
-        clear_dataset(job.folder)
-    open_workspace(job.folder, job.blueprint)
-    return replace(job, blueprint=load_blueprint(job.folder))
+    return MadeDataset(folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
 
 
 def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
@@ -165,10 +159,10 @@ def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progr
     """Make the shards; return their rows."""
     made = 0
     with closing(_results(job, tasks, workers)) as results:
-        for rows, outcome in results:
+        for rows, fates in results:
             made += rows
             if progress is not None:
-                progress(rows, outcome)
+                progress(rows, fates)
     return made
 
 
@@ -226,7 +220,7 @@ def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list
         damaged = list(dict.fromkeys(finding.file for finding in findings))
         if sealed:  # without a manifest the dataset was unfinished: a run may have ended just before
             warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
-    finalize(job.folder, notes=notes)
+    finalize(job.folder, job.blueprint, notes=notes)
     return True, damaged
 
 
@@ -237,7 +231,8 @@ def _check(workers: int | None, part: tuple[int, int] | None, *, force: bool) ->
     if part is not None:
         _check_part(part)
     if force and part is not None:
-        raise UsageError("--force would delete what the other parts have made: remove the folder, then start the parts")
+        lost = "what the other parts have made"
+        raise UsageError(f"force=True would delete {lost}: remove the folder, then start the parts")
     source_date()
 
 

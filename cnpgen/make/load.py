@@ -1,4 +1,4 @@
-"""Find, list and load recipes: those that cnpgen ships by name, anybody's by path."""
+"""Dataset recipes from files, by name or path, and from the blueprints of datasets."""
 
 from dataclasses import replace
 from functools import partial
@@ -14,10 +14,10 @@ from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
-from cnpgen.schema.catalogue import find_file, load_recipe, read_kind, reference
+from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
-from cnpgen.schema.toml import Kind, is_kind, read_table
+from cnpgen.schema.toml import is_kind, read_table
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
@@ -54,7 +54,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
 
 
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
-    """Rebuild a recipe from what ``recipes.resolved`` made of it, as plans of datasets keep it.
+    """Rebuild a recipe from what ``resolved`` made of it, as blueprints of datasets keep it.
 
     Args:
         content: The resolved recipe.
@@ -82,23 +82,6 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     if made is None or mistakes:
         raise RecipeError(mistakes)
     return replace(made, path=path)
-
-
-def find_recipe(kind: Kind, name_or_path: str | Path, *, relative_to: Path | None = None) -> Path:
-    """Find the file of a recipe.
-
-    Args:
-        kind: "problem", "pipeline" or "dataset".
-        name_or_path: A path if it ends in ``.toml``, has a path separator or is a file; else a shipped recipe's name.
-        relative_to: Folder that a path is relative to; by default the working directory.
-
-    Raises:
-        RecipeError: There is no such recipe.
-    """
-    try:
-        return find_file((kind,), name_or_path, relative_to)
-    except ValueError as error:
-        raise RecipeError([str(error)]) from error
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:

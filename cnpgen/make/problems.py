@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, lacks
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
@@ -72,7 +72,7 @@ def load_problems(folder: str | Path, *, split: str = "train", start: int = 0, n
     n = None if n is None else integer("n", n, least=1)
     dataset = open_dataset(Path(folder))
     if split not in dataset.blueprint.splits:
-        raise UsageError(f"{folder} has no split {split!r}: expected one of {', '.join(dataset.blueprint.splits)}")
+        raise UsageError(f"{folder} {lacks('split', split, dataset.blueprint.splits)}")
     rows = dataset.blueprint.splits[split]
     stop = rows if n is None else start + n
     if not 0 <= start < stop <= rows:

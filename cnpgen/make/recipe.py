@@ -14,6 +14,7 @@ from cnpgen.problems.problem import resolved, without_labels
 from cnpgen.schema.keys import NAME, field
 
 SPLIT_NAME = "^[a-z][a-z0-9_]*$"
+MAX_SEED = 2**63 - 1
 VERSION = r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$"
 
 
@@ -31,7 +32,7 @@ class DatasetRecipe:
     pipeline: Pipeline = field(
         "name of a shipped pipeline, or path of a pipeline file relative to this one", form="a name or a path"
     )
-    seed: int = field("root seed", default=0, low=0, high=2**63 - 1)
+    seed: int = field("root seed", default=0, low=0, high=MAX_SEED)
     splits: dict[str, int] = field("rows per split", low=1, pattern=SPLIT_NAME)
     license: str = field("licence of the rows", default="CC-BY-4.0")
     path: Path = Path()
@@ -80,7 +81,7 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
 
 
 def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
-    """Hash a pipeline that was resolved, here or, as plans of datasets keep it, elsewhere; see ``recipe_digest``.
+    """Hash a pipeline that was resolved, here or, as blueprints of datasets keep it, elsewhere; see ``recipe_digest``.
 
     Args:
         pipeline: What ``resolved`` made of it.

@@ -17,11 +17,11 @@ from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.blueprint import Blueprint, ShardTask
+from cnpgen.store.fates import Fates, merge_fates
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import Fates, merge_fates
 from cnpgen.store.record import commit_shard
 from cnpgen.store.shard import storage_dtype
-from cnpgen.store.workspace import require_plan
+from cnpgen.store.workspace import require_blueprint
 
 SPOT_CHECKS = 32  # rows of every shard that Pinocchio and Coal recompute before it is written
 
@@ -32,7 +32,7 @@ class Job:
 
     Attributes:
         folder: The dataset.
-        blueprint: Its plan.
+        blueprint: What it will hold.
         pipeline: The recipe.
         backend: Which kernels run.
         cache_folder: Where they are cached.
@@ -43,6 +43,11 @@ class Job:
     pipeline: Pipeline
     backend: Backend
     cache_folder: Path
+
+
+def prepare(job: Job) -> PreparedPipeline:
+    """Load the stages of what is made."""
+    return PreparedPipeline(job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype)
 
 
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Fates]]:
@@ -62,16 +67,16 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Fat
     """
     started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     prepared = _prepared(job)
-    for task, (columns, outcome) in zip(tasks, shard_columns(prepared, job.blueprint, tasks), strict=True):
-        found = replace(outcome, verification=spot_check(prepared, columns, job.blueprint, task))
-        require_plan(job.folder, job.blueprint)
+    for task, (columns, fates) in zip(tasks, shard_columns(prepared, job.blueprint, tasks), strict=True):
+        found = replace(fates, verification=spot_check(prepared, columns, job.blueprint, task))
+        require_blueprint(job.folder, job.blueprint)
         seconds = round(time.perf_counter() - clock, 3)
         commit_shard(
             job.folder,
             job.blueprint,
             task,
             columns=columns,
-            outcome=found,
+            fates=found,
             started=started,
             seconds=seconds,
             versions=versions(),
@@ -91,7 +96,7 @@ def shard_columns(
         tasks: The shards, in order.
 
     Yields:
-        ``(columns, outcome)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,), and the
+        ``(columns, fates)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,), and the
         fates of the draws.
     """
     pieces = _pieces(prepared, blueprint.seed, tasks)
@@ -103,7 +108,7 @@ def shard_columns(
             field.name: _stored([part.columns[field.name] for part in parts], field, blueprint)
             for field in blueprint.fields
         }
-        yield columns, merge_fates([part.outcome for part in parts])
+        yield columns, merge_fates([part.fates for part in parts])
 
 
 def _pieces(prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]) -> Iterator[Block]:
@@ -151,7 +156,7 @@ def spot_check(
         wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)
         raise MachineError(
             f"row {task.first_row + rows[report.out[0]]} of split {task.split!r} fails Pinocchio's check ({wrong}):"
-            f" the {blueprint.backend!r} backend computes wrong numbers on this machine; try another --backend"
+            f" the {blueprint.backend!r} backend computes wrong numbers on this machine; try another backend="
         )
     return {check.name: check.worst for check in report.checks}
 
@@ -164,7 +169,5 @@ def _prepared(job: Job) -> PreparedPipeline:
     key = f"{job.blueprint.fingerprint} {job.cache_folder}"
     if key not in _PREPARED:
         _PREPARED.clear()
-        _PREPARED[key] = PreparedPipeline(
-            job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype
-        )
+        _PREPARED[key] = prepare(job)
     return _PREPARED[key]

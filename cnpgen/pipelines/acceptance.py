@@ -45,25 +45,25 @@ def acceptance(context: Context, written: set[str]) -> Work:
     reasons = [constraint.reason for constraint in context.problem.constraint]
     n = context.robot.n
 
-    def run(batch: Round, _random: np.random.Generator) -> None:
-        tops = sample_tops(context.problem, batch)
+    def work(draws: Round, _random: np.random.Generator) -> None:
+        tops = sample_tops(context.problem, draws)
         unmet = []
         for end in ends:
-            acceleration = batch.columns.get(f"{end}_ddq")
+            acceleration = draws.columns.get(f"{end}_ddq")
             if acceleration is None:
-                acceleration = np.zeros((n, len(batch.alive)))
-            (count,) = kernels[end](batch[f"{end}_q"], batch[f"{end}_dq"], acceleration, tops, batch[f"{end}_xyz"])
+                acceleration = np.zeros((n, len(draws.alive)))
+            (count,) = kernels[end](draws[f"{end}_q"], draws[f"{end}_dq"], acceleration, tops, draws[f"{end}_xyz"])
             unmet.append(count)
         met = np.maximum(*unmet) <= 0
         gates = list(zip([*reasons, "tip not at its position"], met, strict=True))
         if hitting is not None:
-            (missed,) = hitting(batch["goal_q"], batch["goal_dq"], batch["hit_angle"], batch["hit_speed"])
+            (missed,) = hitting(draws["goal_q"], draws["goal_dq"], draws["hit_angle"], draws["hit_speed"])
             gates.append(("hit not along its direction", missed[0] <= 0))
-        alive = batch.alive
+        alive = draws.alive
         for reason, ok in gates:
-            batch.reject(ok[np.searchsorted(alive, batch.alive)], reason)
+            draws.reject(ok[np.searchsorted(alive, draws.alive)], reason)
 
-    return run
+    return work
 
 
 def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str) -> Any:

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from cnpgen.pipelines.stages.stage import Round
 from cnpgen.pipelines.tally import Tally
+from cnpgen.store.fates import Fates
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import Fates
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class Block:
 
     Attributes:
         columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
-        outcome: Draws, rejections and densities.
+        fates: Draws, rejections and densities.
     """
 
     columns: dict[str, NDArray[Any]]
-    outcome: Fates
+    fates: Fates
 
 
 class Piece:
@@ -40,23 +40,23 @@ class Piece:
         self._tally = Tally(fields)
         self._parts: list[dict[str, NDArray[Any]]] = []
 
-    def take(self, batch: Round, made: int) -> bool:
+    def take(self, draws: Round, made: int) -> bool:
         """Take what belongs to the piece from a round.
 
         Args:
-            batch: The round.
+            draws: The round.
             made: Rows of the block that were accepted before it.
 
         Returns:
             Whether the piece is whole; the round may have rows of the next one.
         """
-        taken = batch.alive[: self.stop - made]
+        taken = draws.alive[: self.stop - made]
         end = made + len(taken)
         if end < self.first:
             return False
         skip = min(max(self.first - made, 0), len(taken))
-        attempts = self._tally.count(batch, taken, first=skip, last=end == self.stop)
-        part = {field.name: batch[field.name][:, skip : len(taken)] for field in self._fields[:-2]}
+        attempts = self._tally.count(draws, taken, first=skip, last=end == self.stop)
+        part = {field.name: draws[field.name][:, skip : len(taken)] for field in self._fields[:-2]}
         self._parts.append({**part, "attempts": attempts[None]})
         return end == self.stop
 
@@ -68,4 +68,4 @@ class Piece:
         """
         columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
         columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
-        return Block(columns, self._tally.outcome())
+        return Block(columns, self._tally.fates())

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.pipelines.stages.stage import Array, Round
+from cnpgen.store.fates import DensityMap, Fates
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import DensityMap, Fates
 
 CELLS = 24  # along each side of a density map
 
@@ -31,11 +31,11 @@ class Tally:
         self._drawn = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
         self._kept = {field.name: np.zeros(CELLS * CELLS, np.int64) for field in self._maps}
 
-    def count(self, batch: Round, taken: NDArray[np.intp], *, first: int, last: bool) -> NDArray[np.int64]:
+    def count(self, draws: Round, taken: NDArray[np.intp], *, first: int, last: bool) -> NDArray[np.int64]:
         """Count the draws of a finished round that belong to the rows asked for.
 
         Args:
-            batch: The round.
+            draws: The round.
             taken: Its draws that became rows, ascending.
             first: How many of these rows come before the first row asked for; they and their draws are not counted.
             last: Whether the last of ``taken`` is the last row asked for: what was drawn after it is not counted.
@@ -45,24 +45,24 @@ class Tally:
         """
         wanted = taken[first:]
         start = int(taken[first - 1]) + 1 if first else 0
-        stop = int(taken[-1]) + 1 if last else batch.size
+        stop = int(taken[-1]) + 1 if last else draws.size
         if first:
             self._waiting = 0
-        fates = np.bincount(batch.fate[start:stop], minlength=1 + len(batch.reasons))
-        for reason, number in zip(batch.reasons, fates[1:].tolist(), strict=True):
+        fates = np.bincount(draws.fate[start:stop], minlength=1 + len(draws.reasons))
+        for reason, number in zip(draws.reasons, fates[1:].tolist(), strict=True):
             self._rejections[reason] = self._rejections.get(reason, 0) + number
-        self._stages.update(batch.origins)
+        self._stages.update(draws.origins)
         self.tried += stop - start
         self.accepted += len(wanted)
         for field in self._maps:
-            cells = _cells(batch.drawn[field.name][:, start:stop], field)
+            cells = _cells(draws.drawn[field.name][:, start:stop], field)
             self._drawn[field.name] += np.bincount(cells, minlength=CELLS * CELLS)
             self._kept[field.name] += np.bincount(cells[wanted - start], minlength=CELLS * CELLS)
         attempts = np.diff(wanted, prepend=start - 1 - self._waiting).astype(np.int64)
         self._waiting = stop - 1 - int(wanted[-1]) if len(wanted) else self._waiting + stop - start
         return attempts
 
-    def outcome(self) -> Fates:
+    def fates(self) -> Fates:
         """Return the counts as they stand."""
         maps = {}
         for field in self._maps:

@@ -32,6 +32,9 @@ class ControlPoints:
     path: Array
     rate: Array
 
+    def __repr__(self) -> str:
+        return f"<ControlPoints: path {np.shape(self.path)}, rate {np.shape(self.rate)}>"
+
 
 def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec) -> ControlPoints:
     """Compute control points; in the type of the arguments, so in float64 where they are.

@@ -22,9 +22,10 @@ from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.load import as_problem
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, as_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema.arguments import integer, number, numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -40,7 +41,8 @@ class Omega:
     has equalities, line and path are bent onto them, in zero steps in the paper.
 
     Args:
-        problem: The problem, or its name or file.
+        problem: The problem, its record (``plans.problem``), or the name or the file of a problem, a pipeline or a
+            dataset.
         path_scale: What phi is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps that bend the path.
@@ -59,7 +61,7 @@ class Omega:
 
     def __init__(
         self,
-        problem: Problem | str | Path,
+        problem: Problem | ProblemRecord | str | Path,
         *,
         path_scale: float = 0.5,
         bending_steps: int = 1,
@@ -103,12 +105,14 @@ class Omega:
         given = dict(vars(boundary))
         if given.pop("goal_ddq") is not None:
             raise UsageError("goal accelerations are left free, so goal_ddq must be None")
-        arrays = {name: numbers(name, values) for name, values in given.items()}
+        arrays = {name: numbers(name, values, differentiable=True) for name, values in given.items()}
         shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
         for name, array in arrays.items():
             if array.shape != shape:
                 raise UsageError(f"{name} must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}")
-        return self._built[0](Boundary(**arrays))
+        checked = Boundary(**arrays)
+        warn_of_far_joints(self._kernels.arguments["robot"], checked)
+        return self._built[0](checked)
 
     def tops(self, tasks: Tasks) -> Array:
         """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""
@@ -162,8 +166,19 @@ class Omega:
             each[lost] = 0
         return found
 
-    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> Plans:
-        """Make plans of what a network says, to be evaluated, refined or saved."""
+    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, sample_id: ArrayLike | None = None) -> Plans:
+        """Make plans of what a network says, to be evaluated, refined or saved.
+
+        Args:
+            tasks: As for the control points.
+            phi: Likewise.
+            log_rate: Likewise.
+            sample_id: Which rows of a dataset the tasks are, shape (N,): ``batch["sample_id"]``, after shuffling, too;
+                0, 1, ... by default.
+
+        Raises:
+            UsageError: A shape is wrong, or something is no real number.
+        """
         points = self(tasks, phi, log_rate)
         return make_plans(
             self.problem,
@@ -171,6 +186,7 @@ class Omega:
             path_control_points=points.path,
             rate_control_points=points.rate,
             columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            sample_id=sample_id,
         )
 
     def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:
@@ -184,7 +200,8 @@ class Omega:
                 raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
 
     def _before_landing(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
-        phi, log_rate = numbers("phi", phi), numbers("log_rate", log_rate)
+        phi = numbers("phi", phi, differentiable=True)
+        log_rate = numbers("log_rate", log_rate, differentiable=True)
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
             return control_points.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)

@@ -16,6 +16,7 @@ from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.moment import states_at_times
@@ -39,6 +40,7 @@ class Planner:
         robot: The robot of its problem.
 
     Raises:
+        UsageError: ``model`` is none, or there is no such file or shipped model.
         CnpgenError: The model cannot be read, or the machine lacks what it needs.
     """
 
@@ -68,32 +70,32 @@ class Planner:
     def plan(
         self,
         start_q: ArrayLike,
+        goal_q: ArrayLike,
+        *,
         start_dq: ArrayLike | None = None,
         start_ddq: ArrayLike | None = None,
-        goal_q: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding, whatever the network gives.
 
         Boundary conditions are not judged: of a start or goal outside of the limits or off the table comes a plan that
-        goes there, and ``evaluate_plans`` says that it is not valid.
+        goes there, and ``evaluate_plans`` says that it is not valid. Only where a joint is so far outside that its
+        position is probably in degrees, or normalised, there is a warning.
 
         Args:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
+            goal_q: Goal positions [rad], likewise, as all that follow.
             start_dq: Start velocities [rad/s]; at rest by default.
             start_ddq: Start accelerations [rad/s^2]; none by default.
-            goal_q: Goal positions [rad]; they must be given.
             goal_dq: Goal velocities [rad/s]; at rest by default.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
 
         Raises:
-            UsageError: A shape is wrong, something is missing or not finite, or something moves that was at rest in
+            UsageError: A shape is wrong, something is not finite, or something moves that was at rest in
                 every row that the model was trained on.
         """
-        if goal_q is None:
-            raise UsageError("goal_q is missing: plan(start_q, start_dq, start_ddq, goal_q, goal_dq)")
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
 
     @one_thread()
@@ -116,6 +118,7 @@ class Planner:
         """
         if boundary.goal_ddq is not None:
             raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
+        warn_of_far_joints(self.robot, boundary)
         return self._kit.plan(self.model, self._rested(boundary), sample_id=sample_id, columns=columns)
 
     def replan(self, plans: Plans, time: ArrayLike, *, goal_q: ArrayLike, goal_dq: ArrayLike | None = None) -> Plans:
@@ -135,7 +138,7 @@ class Planner:
             UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
         """
         q, dq, ddq = states_at(plans, time)
-        return self.plan(q, dq, ddq, goal_q=goal_q, goal_dq=goal_dq)
+        return self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
 
     def _rested(self, boundary: Boundary) -> Boundary:
         """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""

@@ -40,7 +40,7 @@ def read_file(path: Path, model: Model, *, other: bool = False) -> Requests:
     if said.get("format") == FORMAT:
         _check_shard(path, said, model, other=other)
     elif other:
-        raise UsageError(f"--other-rows is for rows of a dataset, and {path} does not say how its rows were drawn")
+        raise UsageError(f"other=True is for rows of a dataset, and {path} does not say how its rows were drawn")
     else:
         _check_said(path, said, model)
     boundary = boundary_in(str(path), found, model)
@@ -66,7 +66,7 @@ def _check_shard(path: Path, said: Mapping[str, str], model: Model, *, other: bo
     elif not other and said.get("recipe_sha256") != model.training.get("dataset", {}).get("recipe_sha256"):
         raise DatasetError(
             f"{path} is a shard whose dataset is not beside it, and of another recipe than the rows that the model was"
-            " trained on; --other-rows plans for it all the same"
+            " trained on; other=True plans for it all the same"
         )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, UsageError, nearest
+from cnpgen.errors import DatasetError, UsageError, lacks
 from cnpgen.planner.boundary_arguments import boundary_of
 from cnpgen.planner.model import Model
 from cnpgen.plans.format import BOUNDARY
@@ -61,7 +61,7 @@ def read_rows(
     dataset = open_dataset(folder)
     check_drawing(str(folder), dataset.blueprint, model, other=other)
     if split not in dataset.blueprint.splits:
-        raise UsageError(f"{folder} has no split {split!r}{nearest(split, dataset.blueprint.splits)}")
+        raise UsageError(f"{folder} {lacks('split', split, dataset.blueprint.splits)}")
     rows = dataset.blueprint.splits[split]
     stop = rows if n is None else first + n
     if not 0 <= first < stop <= rows:
@@ -120,5 +120,5 @@ def check_drawing(where: str, blueprint: Blueprint, model: Model, *, other: bool
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(
         f"the rows of {where} are drawn in another way than those of {name!r} that the model was trained on: the"
-        " recipe has changed since, or it is another one; --other-rows plans for them all the same"
+        " recipe has changed since, or it is another one; other=True plans for them all the same"
     )

@@ -31,6 +31,9 @@ class Tasks:
     expected_time: Array
     correction: Array | None = None
 
+    def __repr__(self) -> str:
+        return f"<Tasks of shape {np.shape(self.boundary.start_q)}>"
+
     def __len__(self) -> int:
         return len(self.expected_time)
 

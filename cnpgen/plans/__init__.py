@@ -1,12 +1,14 @@
 """Plans: motions for boundary problems, and the file that they are kept in."""
 
+from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.load import load_plans
-from cnpgen.plans.plans import Plans, concatenate, make_plans, screen
+from cnpgen.plans.plans import PlanIndexError, Plans, make_plans, screen
 from cnpgen.plans.save import save_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.record import ProblemRecord, open_problem, record_problem
 
 __all__ = [
+    "PlanIndexError",
     "PlanStatus",
     "Plans",
     "ProblemRecord",

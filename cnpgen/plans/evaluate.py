@@ -16,6 +16,7 @@ from cnpgen.judges.plans.judge import check_step
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
+from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.record import open_problem
 from cnpgen.schema.arguments import number
 
@@ -37,7 +38,7 @@ class Evaluation:
     """What the verdict says of N plans.
 
     Attributes:
-        plans: The plans.
+        plans: The plans, with tip positions where the joints put the tip.
         verdicts: Their verdicts, in the same order.
         step: Moments that were looked at are no further apart than this [s].
     """
@@ -84,7 +85,8 @@ def evaluate_plans(
     """Judge plans with Pinocchio and Coal on a fine time grid.
 
     Every plan is judged for itself: neither the others nor the number of processes change its verdict. Plans that
-    cannot be evaluated get a verdict that says so.
+    cannot be evaluated get a verdict that says so. Where a column ``start_xyz`` or ``goal_xyz`` is not where the joints
+    put the tip, the joints count, after a warning.
 
     Args:
         plans: The plans.
@@ -99,7 +101,8 @@ def evaluate_plans(
     """
     check_plans_type(plans)
     check_step(step := number("step", step))
-    parts = [plans.select(slice(first, first + PART)) for first in range(0, len(plans), PART)]
+    plans = settle_tips(plans)
+    parts = [plans[first : first + PART] for first in range(0, len(plans), PART)]
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, len(parts))
     verdicts: list[list[Verdict]] = []
     with closing(share_out(partial(_judge, step=step), parts, count, ordered=True)) as results:

@@ -1,5 +1,6 @@
 """Sampling plans in time and writing them in one of several forms."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,12 +30,15 @@ class Exported:
         count: How many plans are in them.
         refused: Index of each plan that could not be exported -> why, naming it.
         invalid: Indices of the exported plans whose status says that they are not valid.
+        held_joints: The file that says where joints stay that move and are not planned: beside plans as csv and
+            joint-trajectory, if the robot has such joints.
     """
 
     files: tuple[Path, ...]
     count: int
     refused: dict[int, str]
     invalid: tuple[int, ...] = ()
+    held_joints: Path | None = None
 
 
 def export_plans(
@@ -44,10 +48,13 @@ def export_plans(
 
     * "npz": one file; ``plan_00000_t`` (K,), ``plan_00000_q``, ``_dq``, ``_ddq`` and ``_jerk`` (K, n) of every plan,
       numbered by its place among ``plans``; ``plan`` and ``sample_id`` (the numbers of those that are there),
-      ``joint_names``.
+      ``joint_names``; ``held_joint_names`` and ``held_joint_positions`` of the joints that move and are not planned.
     * "csv": one file per plan, ``plan_00000.csv``, with a header of names and units.
     * "joint-trajectory": one JSON file per plan, ``plan_00000.json``, with the fields of ROS's
       ``trajectory_msgs/JointTrajectory``.
+
+    Neither a table nor a message has room for joints that are not planned: where the robot has any that move,
+    ``held_joints.yaml`` beside them says where these stay.
 
     Plans that cannot be sampled are left out, and said to be.
 
@@ -75,8 +82,9 @@ def export_plans(
         reasons = "; ".join(list(refused.values())[:3])
         raise DatasetError(f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}")
     files = _write_npz(out, plans, rate, kept) if to == "npz" else _write_each(out, plans, rate, kept, to)
+    held = None if to == "npz" else _write_held_joints(out, plans)
     invalid = tuple(index for index in kept if plans.status[index] == PlanStatus.INVALID)
-    return Exported(files, len(kept), refused, invalid)
+    return Exported(files, len(kept), refused, invalid, held)
 
 
 def _chosen(plans: Plans, only: Sequence[int] | None) -> list[int]:
@@ -119,8 +127,14 @@ def _sampled(plans: Plans, rate: float, kept: list[int]) -> Iterator[tuple[int, 
 
 def _write_npz(out: Path, plans: Plans, rate: float, kept: list[int]) -> tuple[Path, ...]:
     path = out / "plans.npz" if out.is_dir() else out
-    joints = np.array(plans.problem.joint_names)
-    about = {"plan": np.array(kept), "sample_id": plans.sample_id[kept], "joint_names": joints}
+    held = plans.problem.held_joints
+    about = {
+        "plan": np.array(kept),
+        "sample_id": plans.sample_id[kept],
+        "joint_names": np.array(plans.problem.joint_names),
+        "held_joint_names": np.array([*held], np.str_),
+        "held_joint_positions": np.array([*held.values()], np.float64),
+    }
     write_npz(path, about, _sampled(plans, rate, kept))
     return (path,)
 
@@ -135,3 +149,13 @@ def _write_each(out: Path, plans: Plans, rate: float, kept: list[int], to: Form)
         files.append(out / f"plan_{index:05d}.{ending}")
         write_file(files[-1], encode(sampled, plans.problem.joint_names))
     return tuple(files)
+
+
+def _write_held_joints(folder: Path, plans: Plans) -> Path | None:
+    """Say where the joints stay that move and are not planned."""
+    held = plans.problem.held_joints
+    if not held:
+        return None
+    path = folder / "held_joints.yaml"
+    write_file(path, "".join(f"{json.dumps(name)}: {position}\n" for name, position in held.items()))
+    return path

@@ -1,4 +1,4 @@
-"""A plan at evenly spaced moments."""
+"""The forms that plans are exported in: sampled at evenly spaced moments, as tables, messages or an archive."""
 
 import csv
 import io
@@ -19,7 +19,11 @@ from cnpgen.trajectory.motion import Motion
 
 Array = NDArray[np.float64]
 
+UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}
 LEAST_STEP = 0.01  # the last step may be this part of a step; what would be shorter is joined to the step before
+
+# YAML 1.1, which ROS's tools read, takes 1e-05 for a text: a number needs a point before its exponent.
+_WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
 
 @dataclass(frozen=True)
@@ -50,11 +54,8 @@ def sample_plan(motion: Motion, rate: float) -> Sampled:
     return Sampled(t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
 
 
-UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}
-
-
 def csv_table(sampled: Sampled, joints: tuple[str, ...]) -> str:
-    """Write a table; every number reads back as the same float64."""
+    """Write a plan as a table of CSV; every number reads back as the same float64."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["t [s]", *(f"{name} {joint} [{unit}]" for name, unit in UNITS.items() for joint in joints)])
@@ -63,12 +64,8 @@ def csv_table(sampled: Sampled, joints: tuple[str, ...]) -> str:
     return text.getvalue()
 
 
-# YAML 1.1, which ROS's tools read, takes 1e-05 for a text: a number needs a point before its exponent.
-_WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
-
-
 def joint_trajectory(sampled: Sampled, joints: tuple[str, ...]) -> str:
-    """Write a message, one point per line.
+    """Write a plan as a message, ROS's ``trajectory_msgs/JointTrajectory`` as JSON, one point per line.
 
     Positions, velocities and accelerations are given, efforts are not; the time of the header is 0: begin at once.
     """
@@ -87,7 +84,7 @@ def _point(t: float, q: list[float], dq: list[float], ddq: list[float]) -> dict[
 
 
 def write_npz(path: Path, about: dict[str, NDArray[Any]], plans: Iterable[tuple[int, Sampled]]) -> None:
-    """Write an archive plan by plan, atomically: ``numpy.savez`` would need all of them in memory.
+    """Write plans as an archive of NumPy, plan by plan, atomically: ``numpy.savez`` would need all of them in memory.
 
     Args:
         path: Where to.

@@ -1,6 +1,5 @@
 """Reading plan files: names, shapes and types are checked, values are not."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,31 +8,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, RecipeError, UsageError, counted, nearest
+from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.plans.format import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.status import PlanStatus
+from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.problems.record import ProblemRecord, as_record, record_problem
 from cnpgen.store.files.hdf5 import opened_foreign_hdf5
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-SAME_PLACE = 1e-5  # m: what a tip position may differ by from the one that the joints give, float32 included
 
-
-def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None) -> Plans:
+def load_plans(path: str | Path, *, problem: Problem | ProblemRecord | str | Path | None = None) -> Plans:
     """Read plans from a file that cnpgen or anybody else has written.
 
     Names, shapes and types must be right. Values need not be: every plan is judged for itself, later.
 
     Args:
         path: The file.
-        problem: The problem that the plans must be for, by name, path or as loaded. Tolerances may differ from those
-            in the file; those given here count.
+        problem: The problem that the plans must be for, its record, or the name or the file of a problem, a pipeline or
+            a dataset. Tolerances may differ from those in the file; those given here count.
 
     Raises:
         UsageError: There is no such file.
@@ -42,7 +40,7 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
         MachineError: The system would not let us read it.
     """
     path = Path(path)
-    wanted = None if problem is None else record_problem(_loaded(problem))
+    wanted = None if problem is None else as_record(problem)
     require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
     if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
         raise DatasetError(f"{path} is {kind}, not a file of plans")
@@ -52,13 +50,10 @@ def load_plans(path: str | Path, *, problem: str | Path | Problem | None = None)
         columns = _columns(path, file)
     record = _record(path, attributes, wanted)
     try:
-        return _assembled(path, record, columns, attributes)
+        plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
         raise DatasetError(f"{path}: {error}") from error
-
-
-def _loaded(problem: str | Path | Problem) -> Problem:
-    return problem if isinstance(problem, Problem) else load_problem(problem)
+    return settle_tips(plans, where=f"{path}: ")
 
 
 def _columns(path: Path, file: Any) -> dict[str, NDArray[Any]]:
@@ -122,7 +117,7 @@ def _record(path: Path, attributes: Mapping[str, Any], wanted: ProblemRecord | N
     """Find out which problem the plans are for."""
     found = stored_problem(path, attributes) or wanted
     if found is None:
-        help_ = "set its attribute 'problem' to a name or a file, or pass problem=... (--problem of 'evaluate')"
+        help_ = "set its attribute 'problem' to a name or a file, or pass problem= ('cnpgen evaluate' takes it)"
         raise DatasetError(f"{path} does not say its problem: {help_}")
     if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
         where = ", ".join(found.differences(wanted)[:4])
@@ -191,35 +186,8 @@ def _assembled(
     )
     if duration is not None and duration.shape != (len(plans),):
         raise UsageError(f"duration must have shape {(len(plans),)}, got {duration.shape}")
-    stored = {name: values for name, values in plans.columns.items() if name in columns}
     source, options = (_text(path, attributes, name) if name in attributes else "" for name in NOTES)
-    columns = {**plans.columns, **_tips(path, plans, stored)}
-    return replace(plans, columns=columns, source=source, refined_with=options)
-
-
-def _tips(path: Path, plans: Plans, stored: Mapping[str, Array]) -> dict[str, Array]:
-    """Put tip positions right that are not where the joints put the tip: both say where obstacles and goals are.
-
-    Args:
-        path: The file, for the warning.
-        plans: The plans.
-        stored: The columns that the file has.
-    """
-    found = {}
-    for end in ("start", "goal"):
-        name, q = f"{end}_xyz", getattr(plans.boundary, f"{end}_q")
-        if name not in stored:
-            continue
-        tip = plans.problem.tip_positions(q)
-        off = np.linalg.norm(stored[name] - tip, axis=1)
-        wrong = ~(off <= SAME_PLACE) & np.isfinite(tip).all(axis=1)
-        if wrong.any():
-            first = int(np.argmax(wrong))
-            text = f"{path}: {name} of {counted(int(wrong.sum()), 'plan')} is not where {end}_q puts the tip"
-            where = f"the first is plan {first}, {off[first]:.3g} m off"
-            warnings.warn(f"{text} ({where}): what the joints say counts", RuntimeWarning, stacklevel=4)
-            found[name] = np.where(wrong[:, None], tip, stored[name])
-    return found
+    return replace(plans, source=source, refined_with=options)
 
 
 def _statuses(path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]) -> NDArray[np.uint8]:

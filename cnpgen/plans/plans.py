@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
+from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.problems.record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.arguments import integer, numbers
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
@@ -76,14 +78,14 @@ class Plans:
         """Duration of every plan [s], shape (N,); inf or nan where there is none."""
         return self.motion.duration()
 
-    def select(self, which: slice | NDArray[Any]) -> "Plans":
-        """Return some of the plans.
+    def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> "Plans":
+        """Return some of the plans, with all that is known of them; one plan is Plans as well.
 
         Args:
-            which: A mask of shape (N,), indices in any order, or a slice.
+            which: A number, several in any order, a mask of shape (N,), or a slice.
 
         Raises:
-            UsageError: The mask has another length, or there are no such plans.
+            PlanIndexError: The mask has another length, or there are no such plans; it is an IndexError as well.
         """
         which = _checked(which, len(self))
         return replace(
@@ -96,9 +98,16 @@ class Plans:
             status=self.status[which],
         )
 
+    def __iter__(self) -> Iterator["Plans"]:
+        return (self[index] for index in range(len(self)))
+
+
+class PlanIndexError(UsageError, IndexError):
+    """A plan that is not among the plans."""
+
 
 def make_plans(
-    problem: Problem | ProblemRecord,
+    problem: Problem | ProblemRecord | str | Path,
     boundary: Boundary,
     *,
     path_control_points: ArrayLike,
@@ -111,8 +120,10 @@ def make_plans(
 ) -> Plans:
     """Put plans together; what is not given is computed.
 
+    Everything may be arrays of NumPy or JAX, or tensors of torch on the CPU, whose gradients are left behind.
+
     Args:
-        problem: The problem, or its record.
+        problem: The problem, its record, or the name or the file of a problem, a pipeline or a dataset.
         boundary: Boundary conditions, shape (N, n) each.
         path_control_points: Control points of p(s) [rad], shape (N, C, n).
         rate_control_points: Control points of r(s) [1/s], shape (N, R).
@@ -123,10 +134,13 @@ def make_plans(
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
         source: Where they are from, a line of text.
 
+    Warns:
+        UserWarning: A joint position is so far outside of its limits that it is probably in degrees, or normalised.
+
     Raises:
         UsageError: Something has the wrong shape.
     """
-    record = problem if isinstance(problem, ProblemRecord) else record_problem(problem)
+    record = as_record(problem)
     path = numbers("path_control_points", path_control_points)
     parts = {name: None if part is None else numbers(name, part) for name, part in vars(boundary).items()}
     rows = path.shape[0] if path.ndim else 0
@@ -141,6 +155,7 @@ def make_plans(
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
         source=source,
     )
+    warn_of_far_joints(open_problem(record)[1], plans.boundary)
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
     return replace(plans, columns={**plans.columns, **missing})
@@ -154,37 +169,6 @@ def check_plans_type(plans: Any) -> None:
     """
     if not isinstance(plans, Plans):
         raise UsageError(f"expected Plans, as load_plans and make_plans return them, got {type(plans).__name__}")
-
-
-def concatenate(parts: Sequence[Plans]) -> Plans:
-    """Join plans of the same problem that have the same control points and columns.
-
-    Raises:
-        UsageError: They do not fit together.
-    """
-    if not parts:
-        raise UsageError("there are no plans to join")
-    first = parts[0]
-    for index, other in enumerate(parts[1:], 1):
-        for what, mine, its in _kinds(first, other):
-            if mine != its:
-                raise UsageError(f"plans cannot be joined: {what} is {its} in part {index}, but {mine} in part 0")
-    joined = [
-        None if first_part is None else np.concatenate([getattr(part.boundary, name) for part in parts])
-        for name, first_part in vars(first.boundary).items()
-    ]
-    sources, options = (list(dict.fromkeys(getattr(part, name) for part in parts)) for name in NOTES)
-    return replace(
-        first,
-        source="; ".join(filter(None, sources)),
-        refined_with=options[0] if len(options) == 1 else "",
-        boundary=Boundary(*joined),  # type: ignore[arg-type]
-        path_control_points=np.concatenate([part.path_control_points for part in parts]),
-        rate_control_points=np.concatenate([part.rate_control_points for part in parts]),
-        columns={name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns},
-        sample_id=np.concatenate([part.sample_id for part in parts]),
-        status=np.concatenate([part.status for part in parts]),
-    )
 
 
 def screen(plans: Plans) -> NDArray[np.uint8]:
@@ -219,31 +203,20 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
         return which
     found = np.asarray(which)
     found = found.astype(np.int64) if found.size == 0 and found.dtype.kind == "f" else found  # an empty list
-    if found.ndim != 1 or found.dtype.kind not in "biu":
-        raise UsageError(f"plans are selected by a mask, integers or a slice, got {found.dtype} of shape {found.shape}")
+    if found.ndim > 1 or found.dtype.kind not in "biu" or (found.ndim == 0 and found.dtype.kind == "b"):
+        got = f"{found.dtype} of shape {found.shape}"
+        raise PlanIndexError(f"plans are selected by a number, numbers, a mask or a slice, got {got}")
     if found.dtype.kind == "b":
         if len(found) != plans:
-            raise UsageError(f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}")
+            raise PlanIndexError(f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}")
     elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
         wrong = int(found.max() if found.max() >= plans else found.min())
-        raise UsageError(f"there is no plan {wrong}: {plans} plans are numbered from 0")
-    return found
+        raise PlanIndexError(f"there is no plan {wrong}: {plans} plans are numbered from 0")
+    return np.atleast_1d(found)
 
 
 def _parts(boundary: Boundary) -> list[Array | None]:
     return list(vars(boundary).values())
-
-
-def _kinds(first: Plans, other: Plans) -> Iterator[tuple[str, Any, Any]]:
-    """Yield what must be the same in plans that are joined."""
-    yield "the problem", first.problem.comparable_sha256, other.problem.comparable_sha256
-    yield "the degree", first.degree, other.degree
-    for name in ("path_control_points", "rate_control_points"):
-        yield f"the shape of a plan's {name}", getattr(first, name).shape[1:], getattr(other, name).shape[1:]
-    yield "goal_ddq", first.boundary.goal_ddq is not None, other.boundary.goal_ddq is not None
-    yield "the set of columns", sorted(first.columns), sorted(other.columns)
-    for name, values in first.columns.items():
-        yield f"the shape of column {name!r}", values.shape[1:], other.columns[name].shape[1:]
 
 
 def _mistakes(plans: Plans) -> Iterator[str]:

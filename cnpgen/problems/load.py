@@ -5,15 +5,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import PluginError, RecipeError, UsageError
+from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
-from cnpgen.schema.catalogue import load_recipe, read_kind
+from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
-from cnpgen.schema.toml import read_table
+from cnpgen.schema.toml import Kind, read_table
 
 
 def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
@@ -29,18 +29,34 @@ def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -
     return load_recipe(("problem",), name_or_path, relative_to, read_problem)
 
 
-def as_problem(problem: object) -> Problem:
-    """Return the problem that is meant: itself, or what its name or file says.
+def load_problem_behind(name_or_path: str | Path) -> Problem:
+    """Load the problem that a name or a file leads to: a pipeline leads to its problem, a dataset to its pipeline.
+
+    Args:
+        name_or_path: Name of a shipped problem, pipeline or dataset, or path of such a file.
 
     Raises:
-        UsageError: It is nothing of the kind.
-        RecipeError: With every mistake in the file.
+        RecipeError: There is no such recipe, or with every mistake in the problem's file.
     """
-    if isinstance(problem, Problem):
-        return problem
-    if isinstance(problem, str | Path):
-        return load_problem(problem)
-    raise UsageError(f"problem must be the name of a problem, the path of a problem file or a Problem, got {problem!r}")
+    return load_recipe(("problem", "pipeline", "dataset"), name_or_path, None, _read_behind)
+
+
+def _read_behind(path: Path, mistakes: list[str]) -> Problem | None:
+    """Follow the references of a recipe file down to its problem, and read that."""
+    table = read_table(path, ("problem", "pipeline", "dataset"), mistakes)
+    if table is None:
+        return None
+    kinds: tuple[Kind, ...] = ("pipeline", "problem")
+    key = next((kind for kind in kinds if kind in table), None)
+    if key is None:
+        return read_problem(path, mistakes)
+    where = Place(str(path)) / key
+    try:
+        found: Problem | None = reference(key, _read_behind, path.parent)(table[key], where, mistakes)
+    except ValueError as error:
+        mistakes.append(where.says(str(error)))
+        return None
+    return found
 
 
 def read_problem(path: Path, mistakes: list[str]) -> Problem | None:

@@ -3,19 +3,21 @@
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.load import restore_problem
+from cnpgen.errors import UsageError
+from cnpgen.problems.load import load_problem_behind, restore_problem
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.store.files.documents import canonical_sha256, plain
+from cnpgen.store.files.documents import canonical_sha256, differences, plain
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_MOVING = ("revolute", "continuous", "prismatic")
 _JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
 
 
@@ -37,6 +40,9 @@ class ProblemRecord:
 
     recipe: str
     urdf: str
+
+    def __repr__(self) -> str:
+        return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
 
     @cached_property
     def content(self) -> dict[str, Any]:
@@ -61,6 +67,13 @@ class ProblemRecord:
         return tuple(self.content["robot"]["joints"])
 
     @property
+    def held_joints(self) -> dict[str, float]:
+        """Joints of the URDF that move and are not planned -> where they stay [rad or m]: at zero."""
+        joints = ElementTree.fromstring(self.urdf.encode()).iter("joint")  # noqa: S314 - expat expands no external entity
+        moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
+        return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
+
+    @property
     def trajectory(self) -> TrajectorySpec:
         """Parameterisation that the problem suggests."""
         return TrajectorySpec(**self.content["trajectory"])
@@ -77,7 +90,7 @@ class ProblemRecord:
 
     def differences(self, other: "ProblemRecord") -> list[str]:
         """List the keys that keep plans of two problems from being compared: ``"limits.velocity_scale"``."""
-        return list(_differences(_comparable(self), _comparable(other)))
+        return [each.key for each in differences(_comparable(self), _comparable(other))]
 
     @contextmanager
     def restored(self) -> Iterator[Problem]:
@@ -116,6 +129,44 @@ def record_problem(problem: Problem) -> ProblemRecord:
     return ProblemRecord(recipe, problem.urdf_text)
 
 
+def as_problem(problem: object) -> Problem:
+    """Return the problem that is meant: itself, what was written down of it, or what a name or a file leads to.
+
+    Args:
+        problem: A problem, its record, or the name or the file of a problem, a pipeline or a dataset.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: There is no such recipe, or with every mistake in the problem's file.
+    """
+    if isinstance(problem, Problem):
+        return problem
+    if isinstance(problem, ProblemRecord):
+        return _rebuilt(problem)
+    if isinstance(problem, str | Path):
+        return load_problem_behind(problem)
+    expected = "a Problem, a ProblemRecord, or the name or the file of a problem, a pipeline or a dataset"
+    raise UsageError(f"problem must be {expected}, got {problem!r:.60}")
+
+
+def as_record(problem: object) -> ProblemRecord:
+    """Return the record of the problem that is meant, by anything that ``as_problem`` takes.
+
+    Raises:
+        UsageError: It is nothing of the kind.
+        RecipeError: There is no such recipe, or with every mistake in the problem's file.
+    """
+    return problem if isinstance(problem, ProblemRecord) else record_problem(as_problem(problem))
+
+
+@lru_cache(maxsize=8)
+def _rebuilt(record: ProblemRecord) -> Problem:
+    """Rebuild a problem in a folder that is there until this process ends: its URDF may be asked for at any time."""
+    from cnpgen.kernels.cache import temporary_folder
+
+    return restore_problem(record.content, record.urdf, temporary_folder())
+
+
 @lru_cache(maxsize=8)
 def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
     """Rebuild a problem and its robot, both hold the URDF; the files are gone afterwards.
@@ -142,11 +193,3 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
         name = f"{kind['use']} {count + 1}" if count else kind["use"]
         constraints[name] = {key: value for key, value in kind.items() if key not in _JUDGED_BY}
     return kept | {"robot": robot, "constraint": constraints}
-
-
-def _differences(one: Any, other: Any, key: str = "") -> Iterator[str]:
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        for name in [*one, *(name for name in other if name not in one)]:
-            yield from _differences(one.get(name), other.get(name), f"{key}.{name}" if key else name)
-    elif one != other:
-        yield key

@@ -1,5 +1,7 @@
-"""Refining some plans in one process: the refiner of their problem is built once and kept."""
+"""Building the refiner of a problem with all that it needs, and refining plans with it in one process."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
 from typing import TYPE_CHECKING
@@ -7,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.library import choose_backend, problem_kernels
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import ProblemRecord, open_problem
@@ -18,6 +20,7 @@ from cnpgen.refine.refiner import Passes, Refiner
 from cnpgen.refine.solver.criterion import choose_criterion
 from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.task import Refined, Task
+from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -52,12 +55,37 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
 def tasks_of(plans: Plans) -> list[Task]:
     """Return the boundary problem of every plan, with its control points as a start."""
     problem, _ = open_problem(plans.problem)
-    starts, goals = plans.columns["start_xyz"], plans.columns["goal_xyz"]
-    tops = obstacle_tops(problem, starts, goals)
-    return [
-        Task(plans.boundary[i : i + 1], tops[i], starts[i], goals[i], path, rate)
-        for i, (path, rate) in enumerate(zip(plans.path_control_points, plans.rate_control_points, strict=True))
-    ]
+    tasks = _tasks(problem, plans.boundary, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    control_points = zip(plans.path_control_points, plans.rate_control_points, strict=True)
+    return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
+
+
+def load_solver(
+    problem: "Problem", robot: "Robot", kernels: KernelLibrary
+) -> Callable[[Boundary, Array, Array], list[Refined]]:
+    """Load what makes plans from nothing with the problem's own objective, in one thread.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Where kernels are loaded from.
+
+    Returns:
+        A function of the boundary conditions of N motions and of the tip positions at their starts and goals [m],
+        shape (N, 3) each.
+    """
+    refiner = load_refiner(problem, robot, kernels=kernels)
+    jury = Jury(problem, robot, degree=refiner.spec.degree)
+
+    def solve(boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[Refined]:
+        return [refine_task(refiner, jury, task) for task in _tasks(problem, boundary, start_xyz, goal_xyz)]
+
+    return solve
+
+
+def _tasks(problem: "Problem", boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[Task]:
+    tops = obstacle_tops(problem, start_xyz, goal_xyz)
+    return [Task(boundary[i : i + 1], tops[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
 
 
 @lru_cache(maxsize=8)
@@ -78,29 +106,31 @@ def load_refiner(
     *,
     spec: TrajectorySpec | None = None,
     options: RefineOptions = DEFAULT,
+    kernels: KernelLibrary | None = None,
     passes: Passes | None = None,
 ) -> Refiner:
-    """Build the refiner of a problem with the fastest kernels that this machine can run.
+    """Build the refiner of a problem.
 
     Args:
         problem: The problem.
         robot: Its robot.
         spec: Degree and numbers of control points; the problem's by default.
         options: How to refine.
+        kernels: Where kernels are loaded from; by default the fastest that this machine can run.
         passes: Grids and tightening; the usual ones by default.
     """
     from cnpgen.world.state import World
 
-    backend, cache_folder = choose_backend(None)
+    if kernels is None:
+        kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
     return Refiner(
         problem,
         robot,
-        kernels=problem_kernels(problem, robot, backend, cache_folder),
+        kernels=kernels,
         world=World(robot, problem.obstacle, problem.object_size),
         spec=spec,
         criterion=choose_criterion(problem, options.objective, options.weight),
         settings=settings,
         passes=passes,
-        solver=options.solver,
     )

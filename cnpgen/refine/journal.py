@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import MachineError, UsageError, counted
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.documents import differences
 
 MAGIC = b"cnpgen journal 1\n"
-LONGEST = 80  # characters of two values that a message shows
 _DIGEST = hashlib.sha256().digest_size
 _MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # nothing is emptied before it is locked
 
@@ -101,7 +101,7 @@ def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Jour
     if journal.finished and not discard:
         raise UsageError(
             f"{path} holds {counted(len(journal.finished), 'finished plan')} of another run"
-            f" ({', '.join(_differences(frames[0], identity))}): --force throws them away, another output keeps them"
+            f" ({', '.join(_changed(frames[0], identity))}): discard=True throws them away, another output keeps them"
         )
     journal.finished.clear()
     file.seek(0)
@@ -111,27 +111,13 @@ def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Jour
     return journal
 
 
-def _differences(found: bytes, mine: str) -> list[str]:
+def _changed(found: bytes, mine: str) -> list[str]:
     """Say in what two runs differ, with the values where they are short: those of plans are digests."""
     try:
-        theirs, ours = _flat(json.loads(found)), _flat(json.loads(mine))
+        changed = differences(json.loads(found), json.loads(mine))
     except ValueError:
         return ["another version"]
-    return [
-        f"{key} {theirs.get(key)}, now {ours.get(key)}"
-        if len(f"{theirs.get(key)}{ours.get(key)}") < LONGEST
-        else f"other {key}"
-        for key in [*ours, *(key for key in theirs if key not in ours)]
-        if theirs.get(key) != ours.get(key)
-    ]
-
-
-def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested values under dotted keys."""
-    found: dict[str, Any] = {}
-    for key, value in content.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return found
+    return [f"{each.key} {each.found}, now {each.wanted}" if each.is_short else f"other {each.key}" for each in changed]
 
 
 def _lock(path: Path, file: IO[bytes]) -> None:

@@ -9,7 +9,6 @@ from cnpgen.refine.solver.criterion import OBJECTIVES
 from cnpgen.schema.arguments import integer, number
 
 COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks
-SOLVERS = ("own", "ipopt", "sqpmethod")
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,6 @@ class RefineOptions:
         objective: "time": the problem's own objective, time and centrifugal acceleration; "effort" or "jerk" beside the
             time.
         weight: Weight of what is minimised beside the time; by default the problem's, or 1 for effort and jerk.
-        solver: "own": sequential quadratic programming with DAQP; "ipopt" and "sqpmethod" are CasADi's.
         max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down.
         tolerance: Relative change of the objective below which it has settled: what follows only makes it feasible.
             From nothing a tenth of it counts, among obstacles a twentieth.
@@ -32,17 +30,14 @@ class RefineOptions:
 
     objective: str = "time"
     weight: float | None = None
-    solver: str = "own"
     max_iterations: int = sqp.DEFAULT.max_iterations
     tolerance: float = sqp.DEFAULT.cost_tolerance
     step: float = 1e-3
 
     def __post_init__(self) -> None:
-        for what, value, known in (("objective", self.objective, OBJECTIVES), ("solver", self.solver, SOLVERS)):
-            if value not in known:
-                raise UsageError(
-                    f"{what} {value!r} does not exist: expected one of {', '.join(known)}{nearest(value, known)}"
-                )
+        if self.objective not in OBJECTIVES:
+            expected = f"expected one of {', '.join(OBJECTIVES)}{nearest(self.objective, OBJECTIVES)}"
+            raise UsageError(f"objective {self.objective!r} does not exist: {expected}")
         if self.weight is not None and number("weight", self.weight) < 0:
             raise UsageError(f"the weight of an objective must not be negative, got {self.weight}")
         integer("max_iterations", self.max_iterations, least=0)

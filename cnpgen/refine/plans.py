@@ -21,6 +21,7 @@ from cnpgen.machine.versions import __version__
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
+from cnpgen.plans.tips import settle_tips
 from cnpgen.refine.engine import prepare, refine_part
 from cnpgen.refine.journal import Journal, open_journal
 from cnpgen.refine.options import DEFAULT, RefineOptions
@@ -115,6 +116,7 @@ def refine_plans(
     """
     check_plans_type(plans)
     watch = Stopwatch()
+    plans = settle_tips(plans)
     notes = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
     done: dict[int, Refined] = {} if notes is None else dict(notes.finished)
     if begin is not None:
@@ -143,11 +145,11 @@ def _run(
     if not waiting:
         return
     count = worker_count(1 if workers is None and len(waiting) <= ALONE else workers, -(-len(waiting) // PART))
-    size = PART if count > 1 and options.solver == "own" else 1
+    size = PART if count > 1 else 1
     parts = [waiting[first : first + size] for first in range(0, len(waiting), size)]
     prepare(plans, options)  # kernels are compiled once, not by every worker
     watch.prepared()
-    tasks = ((part, plans.select(np.array(part))) for part in parts)
+    tasks = ((part, plans[np.array(part)]) for part in parts)
     advice = "" if journal is None else f": {journal.path} holds what is finished; run the same command again to go on"
     with closing(share_out(partial(_refine, options=options), tasks, count, advice=advice)) as results:
         for part, refined, seconds in results:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.casadi.alternatives import minimise_with
 from cnpgen.refine.fine import FineCheck
 from cnpgen.refine.solver import starts
 from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate, Tightening
@@ -96,7 +95,6 @@ class Refiner:
         criterion: What is minimised beside the time, or None.
         settings: How to iterate.
         passes: Grids and tightening; ``default_passes`` by default.
-        solver: "own", "ipopt" or "sqpmethod".
     """
 
     def __init__(
@@ -110,10 +108,8 @@ class Refiner:
         criterion: Criterion | None = None,
         settings: Settings = DEFAULT,
         passes: Passes | None = None,
-        solver: str = "own",
     ) -> None:
         self.problem, self.robot, self.settings = problem, robot, settings
-        self._minimise = minimise if solver == "own" else partial(minimise_with, solver=solver)
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
         self.stage = ResidualKernels(
@@ -199,7 +195,7 @@ class Refiner:
         bounds = self.bounds(task, which, ends)
         if not np.nanmax(bounds.beyond(ends)) < LOST:
             settings = replace(settings, max_iterations=0)
-        return self._minimise(motion, bounds, x, settings)
+        return minimise(motion, bounds, x, settings)
 
     def transcription(self, task: Task, which: Pass) -> Transcription:
         """Return the motion on the grid of a pass."""

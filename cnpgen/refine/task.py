@@ -36,7 +36,7 @@ class Outcome(IntEnum):
             Outcome.KEPT: "kept as it was given: nothing better was found",
             Outcome.UNSOLVED: "no valid plan was found; this is the best one",
             Outcome.ADJUSTED: "kept as it was given but for its ends, made exact, and its rates, made positive",
-            Outcome.UNSETTLED: "valid, but the objective still fell after --max-iterations steps",
+            Outcome.UNSETTLED: "valid, but the objective still fell when its steps were used up",
             Outcome.UNUSABLE: "the boundary conditions are no numbers",
         }[self]
 

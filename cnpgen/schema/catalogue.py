@@ -1,7 +1,7 @@
 """Recipes by name or path: those that cnpgen ships, anybody's files, and what reads and builds them."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,9 +49,19 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
             f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
         )
     if text not in known:
-        hint = nearest(text, known)
-        raise ValueError(f"unknown {kinds[0]} {text!r}{hint}; known: {', '.join(known) or 'none'}")
+        raise ValueError(f"unknown {_either(kinds)} {text!r}{_hint(text, known)}; known: {', '.join(known) or 'none'}")
     return known[text]
+
+
+def _either(kinds: tuple[Kind, ...]) -> str:
+    """Join kinds: ``"problem, pipeline or dataset"``."""
+    return " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
+
+
+def _hint(text: str, known: Iterable[str]) -> str:
+    """Say of what other kind there is a recipe of this name, or which known name is near."""
+    other = next((kind for kind in reversed(_LAYOUT) if text in list_recipes(kind)), None)
+    return f", which is a {other}" if other else nearest(text, known)
 
 
 def load_recipe(

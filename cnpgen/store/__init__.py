@@ -1,1 +1,1 @@
-"""Datasets on disk: plan, shards, sidecars, manifest and card; the only place that knows their layout."""
+"""Datasets on disk: blueprint, shards, sidecars, manifest and card; the only place that knows their layout."""

@@ -1,5 +1,6 @@
-"""The plan of a dataset: everything that determines its bytes, written before the first shard and never changed."""
+"""The blueprint of a dataset: everything that determines its bytes, in plan.json before the first shard is made."""
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -13,9 +14,9 @@ from cnpgen.store.files.documents import canonical_sha256, load_document, plain,
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
 FORMAT = "cnpgen-plan"
-REVISION = 2  # of the generator: raised by every change after which the same plan would give other rows
+REVISION = 2  # of the generator: raised by every change after which the same blueprint would give other rows
 FORMAT_VERSION = 1
-INFORMATIONAL = ("title", "license", "versions", "recipe")  # what does not make a plan another one; recipe_sha256 does
+INFORMATIONAL = ("title", "license", "versions", "recipe")  # what may differ in equal blueprints; recipe_sha256 may not
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,22 @@ class ShardTask:
         return shard_stem(self.split, self.index) + ".json"
 
 
+@dataclass(frozen=True)
+class StoredProblem:
+    """The problem that a dataset was made for, as text; ``PlanLoss``, ``Omega`` and the like take it.
+
+    Attributes:
+        recipe: The resolved problem as JSON, every number in SI.
+        urdf: The robot's URDF.
+    """
+
+    recipe: str
+    urdf: str
+
+    def __repr__(self) -> str:
+        return f"<problem {json.loads(self.recipe).get('name', '')} of a dataset>"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Blueprint:
     """What a dataset will hold.
@@ -66,7 +83,7 @@ class Blueprint:
         revision: Revision of the generator's code: rows of different ones must not mix.
         fields: The columns, in order.
         robot: Name, digest of the URDF, joint names and limits.
-        versions: Versions of cnpgen, Python and libraries when the plan was made; not part of the plan's identity.
+        versions: Versions of cnpgen, Python and libraries that drew it up; not part of its identity.
     """
 
     name: str
@@ -103,6 +120,19 @@ class Blueprint:
     def key(self) -> int:
         """The first 60 bits of the fingerprint: HDF5 stores numbers under a checksum, texts not."""
         return int(self.fingerprint[:15], 16)
+
+    @property
+    def problem(self) -> StoredProblem:
+        """The problem whose motions the rows are the ends of.
+
+        Raises:
+            DatasetError: The plan does not say.
+        """
+        try:
+            content, urdf = self.recipe["pipeline"]["problem"], self.robot["urdf"]
+        except KeyError as error:
+            raise DatasetError(f"the plan of {self.name} lacks {error}, and so does not say its problem") from None
+        return StoredProblem(json.dumps(content, ensure_ascii=False), str(urdf))
 
     def field_named(self, name: str) -> Field:
         """Return the field called ``name``.
@@ -152,7 +182,7 @@ def default_shard_size(rows: int, block_rows: int = 4096) -> int:
 
 
 def shards(blueprint: Blueprint) -> list[ShardTask]:
-    """List the shards of a plan, split by split, in order; a split without rows has none."""
+    """List the shards of a blueprint, split by split, in order; a split without rows has none."""
     return [
         ShardTask(split, index, first, min(blueprint.shard_size, rows - first))
         for split, rows in blueprint.splits.items()
@@ -161,7 +191,7 @@ def shards(blueprint: Blueprint) -> list[ShardTask]:
 
 
 def shard_attributes(blueprint: Blueprint, task: ShardTask) -> dict[str, str | int]:
-    """Say what a shard's file says about itself; no time, host or path, so that its bytes depend on the plan alone."""
+    """Say what a shard's file says about itself; no time, host or path: its bytes depend on the blueprint alone."""
     return {
         "dataset": blueprint.name,
         "dataset_version": blueprint.version,
@@ -180,14 +210,14 @@ def shard_attributes(blueprint: Blueprint, task: ShardTask) -> dict[str, str | i
 
 
 def to_json(blueprint: Blueprint) -> dict[str, Any]:
-    """Return the plan as a JSON-able dict."""
+    """Return a blueprint as a JSON-able dict."""
     names = [name for name in Blueprint.__dataclass_fields__ if name not in {"fields", "seed"}]
     content = {"seed": str(blueprint.seed), "fields": [asdict(item) for item in blueprint.fields]}
     return {name: getattr(blueprint, name) for name in names} | {name: plain(value) for name, value in content.items()}
 
 
 def from_json(content: Mapping[str, Any]) -> Blueprint:
-    """Rebuild a plan from :func:`to_json`'s dict.
+    """Rebuild a blueprint from :func:`to_json`'s dict.
 
     Raises:
         DatasetError: A key is missing or has the wrong type.
@@ -198,7 +228,7 @@ def from_json(content: Mapping[str, Any]) -> Blueprint:
         arguments["fields"] = tuple(_field(item) for item in content["fields"])
         return Blueprint(**arguments)
     except (KeyError, TypeError, ValueError, AttributeError, UsageError) as error:
-        raise DatasetError(f"the plan is damaged: {type(error).__name__} {error}") from error
+        raise DatasetError(f"plan.json is damaged: {type(error).__name__} {error}") from error
 
 
 def _field(content: Mapping[str, Any]) -> Field:
@@ -209,25 +239,8 @@ def _field(content: Mapping[str, Any]) -> Field:
     return Field(**{**content, "names": tuple(content["names"]), **limits})
 
 
-def save_plan(folder: Path, blueprint: Blueprint) -> None:
-    """Write ``blueprint.json``; a folder that holds the same plan already is left as it is.
-
-    Raises:
-        DatasetError: The folder holds another dataset, or something else.
-        MachineError: The folder cannot be written.
-    """
-    path = folder / PLAN
-    if path.exists():
-        if load_blueprint(folder).fingerprint != blueprint.fingerprint:
-            raise DatasetError(f"{folder} holds another dataset (its plan differs): choose another folder or remove it")
-        return
-    if folder.is_dir() and any(item.name != WORK for item in folder.iterdir()):
-        raise DatasetError(f"{folder} is not empty and holds no dataset: choose another folder or empty it")
-    write_plan(folder, blueprint)
-
-
-def write_plan(folder: Path, blueprint: Blueprint) -> None:
-    """Write ``blueprint.json``, whatever was there.
+def write_blueprint(folder: Path, blueprint: Blueprint) -> None:
+    """Write ``plan.json``, whatever was there.
 
     Raises:
         MachineError: The folder cannot be written.
@@ -237,7 +250,7 @@ def write_plan(folder: Path, blueprint: Blueprint) -> None:
 
 
 def load_blueprint(folder: Path) -> Blueprint:
-    """Read ``blueprint.json``.
+    """Read ``plan.json``.
 
     Raises:
         DatasetError: It is missing, damaged or written by a newer cnpgen.

@@ -136,12 +136,12 @@ def _field_table(fields: Sequence[Field]) -> str:
 
 
 def _yield_table(summary: Summary) -> str:
-    outcome = summary.outcome
-    counts = {"**tried**": outcome.tried, **outcome.rejections, "**accepted**": outcome.accepted}
-    rows = [(name, f"{count:,}", f"{100 * count / max(outcome.tried, 1):.3f} %") for name, count in counts.items()]
+    fates = summary.fates
+    counts = {"**tried**": fates.tried, **fates.rejections, "**accepted**": fates.accepted}
+    rows = [(name, f"{count:,}", f"{100 * count / max(fates.tried, 1):.3f} %") for name, count in counts.items()]
     text = _table(("fate", "draws", "share"), rows)
-    if outcome.verification:
-        worst = [(f"`{name}`", f"{value:.3g}") for name, value in outcome.verification.items()]
+    if fates.verification:
+        worst = [(f"`{name}`", f"{value:.3g}") for name, value in fates.verification.items()]
         text += (
             "\n\nWorst violation in 32 rows of every shard, recomputed with Pinocchio and Coal, in SI units:\n\n"
             + _table(("constraint", "worst"), worst)

@@ -1,4 +1,4 @@
-"""The shallow check of a dataset: every file is there, whole, and what the plan says; no row is computed again."""
+"""The shallow check of a dataset: every file is there, whole, and what the blueprint says; no row is computed again."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _LISTED = (PLAN, STATS, CARD, CROISSANT)
 _NOTHING = "(nothing)"
 
 MAKE_AGAIN = "run the same make-dataset command again: it makes what is damaged or missing and keeps the rest"
-REPLACE = "nothing else says what the dataset was to be: make it again with --force"
+REPLACE = "nothing else says what the dataset was to be: make it again with 'make-dataset --force'"
 DELETE = "delete such a shard and the .json beside it, then run the same make-dataset command again"
 REMOVE = "move elsewhere what is not part of the dataset"
 
@@ -59,7 +59,7 @@ def _silent(_file: str) -> None:
 
 
 def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) -> list[Finding]:
-    """Check the files of a dataset against its manifest, its sidecars and its plan.
+    """Check the files of a dataset against its manifest, its sidecars and its blueprint.
 
     Args:
         folder: The dataset's folder.
@@ -90,7 +90,7 @@ def check_documents(folder: Path, blueprint: Blueprint) -> list[Finding]:
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
 
     Raises:
         MachineError: The system would not let us read something.
@@ -109,18 +109,18 @@ def _reason(error: DatasetError, path: Path) -> str:
 def _check_manifest(folder: Path, blueprint: Blueprint) -> tuple[list[Finding], dict[str, Any]]:
     """Check the manifest and the files it lists; return it empty if it cannot be relied upon."""
     if not (folder / MANIFEST).exists():
-        summary = summarise(folder, blueprint, allow_partial=True)
+        summary = summarise(folder, blueprint, allow_incomplete=True)
         return [Finding(MANIFEST, f"is missing: the dataset is {unfinished(summary)}", advice=MAKE_AGAIN)], {}
     try:
         manifest = load_manifest(folder)
     except DatasetError as error:
         return [Finding(MANIFEST, _reason(error, folder / MANIFEST), advice=MAKE_AGAIN)], {}
     if manifest["plan_fingerprint"] != blueprint.fingerprint:
-        return [Finding(MANIFEST, "is of another plan than plan.json", advice=MAKE_AGAIN)], {}
+        return [Finding(MANIFEST, "is of another blueprint than plan.json", advice=MAKE_AGAIN)], {}
     entries = _shard_entries(manifest)
     findings = []
     if entries.keys() != {task.file for task in shards(blueprint)}:
-        findings.append(Finding(MANIFEST, "lists other shards than the plan", advice=MAKE_AGAIN))
+        findings.append(Finding(MANIFEST, "lists other shards than plan.json", advice=MAKE_AGAIN))
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
         findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", advice=MAKE_AGAIN))
     for name in _LISTED:
@@ -148,7 +148,7 @@ def check_shard(
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         task: Which shard.
         entry: What the manifest says about it, if there is one.
 
@@ -182,7 +182,7 @@ def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding
 
 
 def _is_of_another_plan(path: Path, blueprint: Blueprint) -> bool:
-    """Whether a shard that is not the recorded one is a sound shard of another plan."""
+    """Whether a shard that is not the recorded one is a sound shard of another blueprint."""
     try:
         return read_attributes(path, ["plan_key"])["plan_key"] != blueprint.key
     except DatasetError:
@@ -200,17 +200,17 @@ def _check_sidecar(
         return [Finding(task.sidecar, _reason(error, folder / task.sidecar), advice=MAKE_AGAIN)], expected
     findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
     if record.plan_fingerprint != blueprint.fingerprint:
-        text = f"belongs to another plan ({record.plan_fingerprint[:12]}...)"
+        text = f"belongs to another blueprint ({record.plan_fingerprint[:12]}...)"
         findings.append(Finding(task.sidecar, text, advice=MAKE_AGAIN))
     return findings, expected or (record.bytes, record.sha256)
 
 
 def check_content(folder: Path, blueprint: Blueprint, task: ShardTask) -> list[Finding]:
-    """Compare what a shard says about itself with the plan.
+    """Compare what a shard says about itself with the blueprint.
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         task: Which shard; its file should be known to be as it was written (see :func:`read_attributes`).
 
     Returns:
@@ -223,7 +223,7 @@ def check_content(folder: Path, blueprint: Blueprint, task: ShardTask) -> list[F
         return [Finding(task.file, _reason(error, path), advice=DELETE)]
     expected = {"format": FORMAT, "format_version": FORMAT_VERSION, **shard_attributes(blueprint, task)}
     problems = [
-        f"its {name} is {attributes.get(name)!r}, the plan says {value!r}"
+        f"its {name} is {attributes.get(name)!r}, plan.json says {value!r}"
         for name, value in expected.items()
         if attributes.get(name) != value
     ]
@@ -237,7 +237,7 @@ def check_content(folder: Path, blueprint: Blueprint, task: ShardTask) -> list[F
 
 
 def _check_field(field: Field, found: StoredField, blueprint: Blueprint, task: ShardTask) -> list[str]:
-    """Compare what a shard says about a field with the plan."""
+    """Compare what a shard says about a field with the blueprint."""
     shape = (task.rows, field.width) if field.width else (task.rows,)
     dtype = storage_dtype(field, blueprint.dtype)
     problems = []
@@ -249,7 +249,7 @@ def _check_field(field: Field, found: StoredField, blueprint: Blueprint, task: S
         for name in expected | found.attributes
     }
     return problems + [
-        f"field {field.name!r} has {name} {has!r}, the plan says {planned!r}"
+        f"field {field.name!r} has {name} {has!r}, plan.json says {planned!r}"
         for name, (has, planned) in pairs.items()
         if not np.array_equal(has, planned)
     ]

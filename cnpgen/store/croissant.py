@@ -1,10 +1,13 @@
-"""The Croissant description of a dataset: metadata and files only.
+"""The Croissant description of a dataset: metadata, files and what is measured in which unit.
 
-No record set is promised: no reader of Croissant opens HDF5 (mlcommons/croissant issue 697).
+No record set is promised: no reader of Croissant opens HDF5 (mlcommons/croissant issue 697). Croissant's own fields are
+parts of record sets and have no unit; so the fields are listed as schema.org's ``variableMeasured``, which a Croissant
+document may have as any ``sc:Dataset`` may.
 """
 
 from typing import Any
 
+from cnpgen.store.field import Field
 from cnpgen.store.summary import Summary
 
 _CONTEXT: dict[str, Any] = {
@@ -64,7 +67,19 @@ def croissant_document(summary: Summary, *, created: str) -> dict[str, Any]:
     }
     if blueprint.license:
         document["license"] = f"https://spdx.org/licenses/{blueprint.license}"
-    return document | {"distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records]}
+    return document | {
+        "variableMeasured": [_variable(field) for field in blueprint.fields],
+        "distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records],
+    }
+
+
+def _variable(field: Field) -> dict[str, Any]:
+    """Describe a field; limits are those of all columns together."""
+    columns = f" ({', '.join(field.names)})" if field.names else ""
+    described = {"name": field.name, "description": f"{field.long_name}{columns}", "unitText": field.unit}
+    least = {} if field.valid_min is None else {"minValue": min(field.valid_min)}
+    most = {} if field.valid_max is None else {"maxValue": max(field.valid_max)}
+    return {"@type": "sc:PropertyValue", **described, **least, **most}
 
 
 def _description(summary: Summary) -> str:

@@ -30,3 +30,9 @@ class Field:
     valid_min: tuple[float, ...] | None = None
     valid_max: tuple[float, ...] | None = None
     dtype: str = "float"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns in a table of several fields: ``"start_q.joint_1"``, or ``"hit_speed"`` of a scalar."""
+        names = self.names or tuple(map(str, range(self.width)))
+        return tuple(f"{self.name}.{name}" for name in names) if self.width else (self.name,)

@@ -9,10 +9,10 @@ from typing import Any
 from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, load_blueprint, shards
 from cnpgen.store.check import check_documents
+from cnpgen.store.fates import Fates, densities_to_json
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import plain
 from cnpgen.store.layout import DOCUMENTS, MANIFEST, PLAN
-from cnpgen.store.outcome import Fates, densities_to_json
 from cnpgen.store.paths import require_folder
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 from cnpgen.store.summary import Summary, summarise, unfinished
@@ -25,7 +25,7 @@ class Inspection:
 
     Attributes:
         folder: Its folder.
-        summary: Its plan and the records of its finished shards.
+        summary: Its blueprint and the records of its finished shards.
         sealed: Whether its manifest is there.
         bytes: Size of its files.
         damage: What is wrong with the documents of a sealed dataset, a line each; shards are not read for it.
@@ -39,13 +39,13 @@ class Inspection:
 
     @property
     def blueprint(self) -> Blueprint:
-        """The plan of the dataset."""
+        """The blueprint of the dataset."""
         return self.summary.blueprint
 
     @property
-    def outcome(self) -> Fates:
+    def fates(self) -> Fates:
         """The fates of all draws that were made for the rows that are there."""
-        return self.summary.outcome
+        return self.summary.fates
 
     @property
     def complete(self) -> bool:
@@ -103,10 +103,10 @@ class Inspection:
             "shards": {"planned": self.summary.n_shards, "finished": len(self.summary.records)},
             "rows": {split: {"planned": blueprint.splits[split], "stored": rows} for split, rows in self.rows.items()},
             "fields": [self._field(field) for field in blueprint.fields],
-            "yield": _yield(self.outcome),
-            "yield_by_split": {split: _yield(outcome) for split, outcome in self.summary.outcomes.items()},
-            "densities": densities_to_json(self.outcome.densities),
-            "verification": self.outcome.verification,
+            "yield": _yield(self.fates),
+            "yield_by_split": {split: _yield(fates) for split, fates in self.summary.fates_by_split.items()},
+            "densities": densities_to_json(self.fates.densities),
+            "verification": self.fates.verification,
             "seed": str(blueprint.seed),
             **{
                 name: getattr(blueprint, name)
@@ -128,15 +128,15 @@ class Inspection:
         return content | {"min": found.minimum, "mean": found.mean, "max": found.maximum, "std": found.std}
 
 
-def _yield(outcome: Fates) -> dict[str, Any]:
+def _yield(fates: Fates) -> dict[str, Any]:
     """Return tried, accepted and, in pipeline order, why draws were rejected and how many went on."""
-    tried, left, steps = max(outcome.tried, 1), outcome.tried, []
-    for reason, count in outcome.rejections.items():
+    tried, left, steps = max(fates.tried, 1), fates.tried, []
+    for reason, count in fates.rejections.items():
         left -= count
-        stage = outcome.stages.get(reason, "")
+        stage = fates.stages.get(reason, "")
         steps.append({"stage": stage, "reason": reason, "draws": count, "share": count / tried, "left": left / tried})
-    share = outcome.accepted / tried
-    return {"tried": outcome.tried, "accepted": outcome.accepted, "acceptance": share, "rejections": steps}
+    share = fates.accepted / tried
+    return {"tried": fates.tried, "accepted": fates.accepted, "acceptance": share, "rejections": steps}
 
 
 def inspect_dataset(folder: str | Path) -> Inspection:
@@ -147,7 +147,7 @@ def inspect_dataset(folder: str | Path) -> Inspection:
 
     Raises:
         UsageError: There is no such folder.
-        DatasetError: It holds no dataset, or its plan is damaged.
+        DatasetError: It holds no dataset, or its plan.json is damaged.
         MachineError: The system would not let us read something.
     """
     folder = Path(folder)
@@ -158,7 +158,7 @@ def inspect_dataset(folder: str | Path) -> Inspection:
         blueprint = load_blueprint(folder)
     except DatasetError as error:
         raise DatasetError(f"{error}; 'cnpgen validate' says what to do") from error
-    summary = summarise(folder, blueprint, allow_partial=True)
+    summary = summarise(folder, blueprint, allow_incomplete=True)
     sealed = (folder / MANIFEST).is_file()
     damage = tuple(str(finding) for finding in check_documents(folder, blueprint)) if sealed else ()
     return Inspection(folder, summary, sealed, _size(folder, blueprint), damage)

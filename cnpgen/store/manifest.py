@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import Blueprint, load_blueprint
+from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
 from cnpgen.store.field import Field
@@ -23,24 +23,25 @@ FORMAT = "cnpgen-dataset"
 FORMAT_VERSION = 1
 
 
-def finalize(folder: Path, *, notes: str = "") -> dict[str, Any]:
+def finalize(folder: Path, blueprint: Blueprint, *, notes: str = "") -> dict[str, Any]:
     """Sum up the shards of a dataset: statistics, card, Croissant and, last, the manifest.
 
     The same shards give the same files; processes that find all shards made may do it at once.
 
     Args:
         folder: The dataset's folder.
+        blueprint: Its blueprint.
         notes: Text about the dataset to include in its card, Markdown.
 
     Returns:
         The manifest.
 
     Raises:
-        DatasetError: Shards are missing, damaged or of another plan; the message says which.
+        DatasetError: Shards are missing, damaged or of another blueprint; the message says which.
         UsageError: SOURCE_DATE_EPOCH is no time.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    summary = summarise(folder, load_blueprint(folder))
+    summary = summarise(folder, blueprint)
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
@@ -113,8 +114,8 @@ def _manifest(folder: Path, summary: Summary, *, created: str) -> dict[str, Any]
         "plan_fingerprint": blueprint.fingerprint,
         **_origin(summary),
         "features": {field.name: _feature(field, blueprint) for field in blueprint.fields},
-        "yield": summary.outcome.yield_json(),
-        "verification": dict(summary.outcome.verification),
+        "yield": summary.fates.yield_json(),
+        "verification": dict(summary.fates.verification),
         "splits": {split: _split(folder, summary, split) for split in blueprint.splits},
         "stats": STATS,
         "files": {name: _listed(folder / name) for name in (PLAN, STATS, CARD, CROISSANT)},
@@ -184,8 +185,8 @@ def _split(folder: Path, summary: Summary, split: str) -> dict[str, Any]:
         }
         for task, record in summary.of_split(split)
     ]
-    outcome = summary.outcomes[split]
-    return {"rows": summary.blueprint.splits[split], "yield": outcome.yield_json(), "shards": entries}
+    fates = summary.fates_by_split[split]
+    return {"rows": summary.blueprint.splits[split], "yield": fates.yield_json(), "shards": entries}
 
 
 def _listed(path: Path) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def find_damaged(
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         tasks: Shards that were made.
         progress: Called with every shard that was compared.
 

@@ -1,10 +1,13 @@
 """What users point at: the folder of a dataset, a file. What is not there is a mistake in an argument, not damage."""
 
-import re
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.store.files.kind import HDF5, own_kind
 from cnpgen.store.workspace import is_dataset
+
+PLANS = "a file of plans"
+_SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 
 
 def require_folder(folder: Path) -> None:
@@ -39,12 +42,6 @@ def require_file(path: Path, what: str, *, of_dataset: str = "") -> None:
         raise UsageError(f"{path} is not there, expected {what}")
 
 
-HDF5 = b"\x89HDF\r\n\x1a\n"
-_HEAD = re.compile(rb"cnpgen[- ]([a-z]+) [0-9]")  # of models and checkpoints, which are sealed, and of journals
-PLANS = "a file of plans"
-_SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
-
-
 def file_kind(path: Path) -> str:
     """Say what a file is: "a model of cnpgen", "a file of plans"; nothing where that is not known."""
     try:
@@ -52,9 +49,7 @@ def file_kind(path: Path) -> str:
             head = file.read(64)
     except OSError:
         return ""
-    if found := _HEAD.match(head):
-        return f"a {found[1].decode()} of cnpgen"
-    return _hdf5_kind(path) if head.startswith(HDF5) else ""
+    return own_kind(head) or (_hdf5_kind(path) if head.startswith(HDF5) else "")
 
 
 def _hdf5_kind(path: Path) -> str:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, MachineError
+from cnpgen.store.fates import DensityMap
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.inspection import Inspection
-from cnpgen.store.outcome import DensityMap
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.statistics import FieldStatistics
 
@@ -99,7 +99,7 @@ def _draw_histogram(axis: "Axes", found: FieldStatistics, column: int) -> None:
 
 def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:
     """Draw some motions from above, and per end how many of its draws were accepted where."""
-    maps = inspection.outcome.densities
+    maps = inspection.fates.densities
     axes = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
     _draw_motions(axes[0], _some_rows(inspection))
     for axis, (name, density) in zip(axes[1:], maps.items(), strict=True):
@@ -113,7 +113,7 @@ def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:
 
 def _some_rows(inspection: Inspection) -> dict[str, NDArray[Any]]:
     """Read the first rows of the first split that has any."""
-    dataset = open_dataset(inspection.folder, allow_partial=True)
+    dataset = open_dataset(inspection.folder, allow_incomplete=True)
     wanted = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
     fields = [field.name for field in inspection.blueprint.fields if field.name in wanted]
     split = next(split for split, rows in inspection.rows.items() if rows)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, nearest
+from cnpgen.errors import DatasetError, lacks
 from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.intact import require_intact
-from cnpgen.store.layout import MANIFEST
+from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import load_manifest
 from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed, load_record
@@ -28,7 +28,7 @@ class StoredDataset:
 
     Attributes:
         folder: Its folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         manifest: Its manifest; None while it is unfinished.
     """
 
@@ -43,7 +43,7 @@ class StoredDataset:
             DatasetError: There is no such split.
         """
         if split not in self.blueprint.splits:
-            raise DatasetError(f"{self.folder} has no split {split!r}{nearest(split, self.blueprint.splits)}")
+            raise DatasetError(f"{self.folder} {lacks('split', split, self.blueprint.splits)}")
         found = [task for task in shards(self.blueprint) if task.split == split]
         if self.manifest is None:
             return [task for task in found if is_committed(self.folder, task, self.blueprint.fingerprint)]
@@ -56,7 +56,7 @@ class StoredDataset:
 
         Args:
             split: Name of the split.
-            fields: Names of the fields; all by default, in the plan's order.
+            fields: Names of the fields; all by default, in the blueprint's order.
 
         Yields:
             The shard, and field name -> values, shape (rows, width) or (rows,).
@@ -75,7 +75,7 @@ class StoredDataset:
 
         Args:
             split: Name of the split.
-            fields: Names of the fields; all by default, in the plan's order.
+            fields: Names of the fields; all by default, in the blueprint's order.
             start: First row.
             stop: Row after the last one; all by default.
 
@@ -133,16 +133,16 @@ def _of_sidecar(folder: Path, task: ShardTask) -> tuple[int, str]:
     return record.bytes, record.sha256
 
 
-def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDataset:
+def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:
     """Open a dataset for reading.
 
     Args:
         folder: Its folder.
-        allow_partial: Open it even if it is unfinished.
+        allow_incomplete: Open it even if it is unfinished.
 
     Raises:
         UsageError: There is no such folder.
-        DatasetError: It holds no dataset, it is unfinished, or its plan or manifest is damaged.
+        DatasetError: It holds no dataset, it is unfinished, or its plan.json or manifest is damaged.
         MachineError: The system would not let us read something.
     """
     folder = Path(folder)
@@ -151,8 +151,10 @@ def open_dataset(folder: str | Path, *, allow_partial: bool = False) -> StoredDa
     if (folder / MANIFEST).exists():
         manifest = load_manifest(folder)
         if manifest["plan_fingerprint"] != blueprint.fingerprint:
-            raise DatasetError(f"{folder / MANIFEST} is of another plan than plan.json: the folder mixes two datasets")
+            raise DatasetError(
+                f"{folder / MANIFEST} is of another blueprint than {PLAN}: the folder mixes two datasets"
+            )
         return StoredDataset(folder, blueprint, manifest)
-    if not allow_partial:
-        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_partial=True))}")
+    if not allow_incomplete:
+        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_incomplete=True))}")
     return StoredDataset(folder, blueprint, None)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, shard_attributes, shards
+from cnpgen.store.fates import Fates, fates_from_json
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import WORK
-from cnpgen.store.outcome import Fates, outcome_from_json
 from cnpgen.store.shard import write_shard
 from cnpgen.store.statistics import FieldStatistics, column_statistics, statistics_from_json
 
@@ -32,7 +32,7 @@ class ShardRecord:
         first_sample_id: Index of its first row within the split.
         plan_fingerprint: Fingerprint of the plan it belongs to.
         statistics: Field name -> statistics of its columns.
-        outcome: Fates of the draws that were made for it.
+        fates: Fates of the draws that were made for it.
         started: When the work on it began, ISO 8601 in UTC.
         seconds: How long the work took [s].
         versions: Versions of cnpgen, Python and libraries that made it.
@@ -45,7 +45,7 @@ class ShardRecord:
     first_sample_id: int
     plan_fingerprint: str
     statistics: Mapping[str, FieldStatistics]
-    outcome: Fates
+    fates: Fates
     started: str = ""
     seconds: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -58,7 +58,7 @@ def record_to_json(record: ShardRecord) -> dict[str, Any]:
     """Return a record as a JSON-able dict."""
     return {
         **{name: getattr(record, name) for name in _PLAIN},
-        "outcome": record.outcome.to_json(),
+        "outcome": record.fates.to_json(),
         "statistics": {name: item.to_json() for name, item in record.statistics.items()},
     }
 
@@ -71,8 +71,8 @@ def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
     """
     try:
         statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
-        outcome = outcome_from_json(content["outcome"])
-        return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, outcome=outcome)
+        fates = fates_from_json(content["outcome"])
+        return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, fates=fates)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DatasetError(f"the shard's record is damaged: {type(error).__name__} {error}") from error
 
@@ -108,7 +108,7 @@ def commit_shard(
     task: ShardTask,
     *,
     columns: Mapping[str, NDArray[Any]],
-    outcome: Fates,
+    fates: Fates,
     started: str = "",
     seconds: float = 0.0,
     versions: Mapping[str, str] | None = None,
@@ -117,10 +117,10 @@ def commit_shard(
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         task: Which shard.
         columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
-        outcome: Fates of the draws that were made for it.
+        fates: Fates of the draws that were made for it.
         started: When the work on it began, ISO 8601 in UTC.
         seconds: How long the work took [s].
         versions: Versions of cnpgen, Python and libraries that made it.
@@ -129,12 +129,12 @@ def commit_shard(
         The shard's record.
 
     Raises:
-        DatasetError: The columns are not what the plan says, or not finite.
+        DatasetError: The columns are not what the blueprint says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
     if is_committed(folder, task, blueprint.fingerprint):  # by somebody to whom the same work was given
         return load_record(folder, task)
-    about = {"outcome": outcome, "started": started, "seconds": seconds, "versions": versions or {}}
+    about = {"fates": fates, "started": started, "seconds": seconds, "versions": versions or {}}
     try:
         return _write(folder, blueprint, task, columns, about)
     except CnpgenError:
@@ -171,20 +171,21 @@ def _write(
 
 
 def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardRecord:
-    """Read a shard's sidecar and make sure that it stands for a shard of this plan; the shard's content is not read.
+    """Read a shard's sidecar and make sure that it stands for a shard of this blueprint; the shard itself is not read.
 
     Args:
         folder: The dataset's folder.
         task: Which shard.
-        fingerprint: The plan's fingerprint.
+        fingerprint: The fingerprint of the blueprint.
 
     Raises:
-        DatasetError: The sidecar is missing, damaged or of another plan, or the shard is missing or has another size.
+        DatasetError: The sidecar is missing, damaged or of another blueprint, or the shard is missing or of another
+            size.
         MachineError: The system would not let us read it.
     """
     record = load_record(folder, task)
     if record.plan_fingerprint != fingerprint:
-        raise DatasetError(f"{folder / task.sidecar} belongs to another plan ({record.plan_fingerprint[:12]}...)")
+        raise DatasetError(f"{folder / task.sidecar} belongs to another blueprint ({record.plan_fingerprint[:12]}...)")
     path = folder / task.file
     size = path.stat().st_size if path.is_file() else None
     if size != record.bytes:
@@ -199,7 +200,7 @@ def check_committed(folder: Path, task: ShardTask, fingerprint: str) -> None:
     Args:
         folder: The dataset's folder.
         task: Which shard.
-        fingerprint: The plan's fingerprint.
+        fingerprint: The fingerprint of the blueprint.
 
     Raises:
         DatasetError: Like :func:`load_committed`, or the shard was changed.
@@ -211,7 +212,7 @@ def check_committed(folder: Path, task: ShardTask, fingerprint: str) -> None:
 
 
 def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
-    """Whether a shard is made: its sidecar is whole and of this plan, and its file has the recorded size."""
+    """Whether a shard is made: its sidecar is whole and of this blueprint, and its file has the recorded size."""
     try:
         load_committed(folder, task, fingerprint)
     except DatasetError:

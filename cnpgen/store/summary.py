@@ -8,7 +8,7 @@ from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, shards
-from cnpgen.store.outcome import Fates, densities_to_json, merge_fates
+from cnpgen.store.fates import Fates, densities_to_json, merge_fates
 from cnpgen.store.record import ShardRecord, load_committed
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 
@@ -19,11 +19,11 @@ _N_SHOWN = 5
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """A plan and the records of its shards.
+    """A blueprint and the records of its shards.
 
     Attributes:
-        blueprint: The plan.
-        records: Every finished shard and its record, in the plan's order.
+        blueprint: The blueprint.
+        records: Every finished shard and its record, in the blueprint's order.
         problems: Why each of the others is not finished.
     """
 
@@ -33,7 +33,7 @@ class Summary:
 
     @property
     def n_shards(self) -> int:
-        """Number of shards of the plan."""
+        """Number of shards of the blueprint."""
         return len(self.records) + len(self.problems)
 
     def of_split(self, split: str) -> list[tuple[ShardTask, ShardRecord]]:
@@ -41,16 +41,14 @@ class Summary:
         return [(task, record) for task, record in self.records if task.split == split]
 
     @cached_property
-    def outcomes(self) -> dict[str, Fates]:
+    def fates_by_split(self) -> dict[str, Fates]:
         """The fates of the draws, split by split."""
-        return {
-            split: merge_fates([item.outcome for _, item in self.of_split(split)]) for split in self.blueprint.splits
-        }
+        return {split: merge_fates([item.fates for _, item in self.of_split(split)]) for split in self.blueprint.splits}
 
     @cached_property
-    def outcome(self) -> Fates:
+    def fates(self) -> Fates:
         """The fates of all draws."""
-        return merge_fates(list(self.outcomes.values()))
+        return merge_fates(list(self.fates_by_split.values()))
 
     @cached_property
     def statistics(self) -> dict[str, dict[str, FieldStatistics]]:
@@ -59,16 +57,16 @@ class Summary:
         return {split: merge_statistics(items) for split, items in parts.items() if items}
 
 
-def summarise(folder: Path, blueprint: Blueprint, *, allow_partial: bool = False) -> Summary:
+def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = False) -> Summary:
     """Read the sidecars of a dataset.
 
     Args:
         folder: The dataset's folder.
-        blueprint: Its plan.
-        allow_partial: Take what is there instead of refusing.
+        blueprint: Its blueprint.
+        allow_incomplete: Take what is there instead of refusing.
 
     Raises:
-        DatasetError: A shard is missing, damaged or of another plan; the message says which.
+        DatasetError: A shard is missing, damaged or of another blueprint; the message says which.
         MachineError: The system would not let us read something.
     """
     records, problems = [], []
@@ -78,7 +76,7 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_partial: bool = False
         except DatasetError as error:
             problems.append(str(error))
     summary = Summary(blueprint, tuple(records), tuple(problems))
-    if problems and not allow_partial:
+    if problems and not allow_incomplete:
         more = [f"and {len(problems) - _N_SHOWN} more"] if len(problems) > _N_SHOWN else []
         shown = "\n  ".join([*problems[:_N_SHOWN], *more])
         raise DatasetError(f"{folder} is {unfinished(summary)}:\n  {shown}")
@@ -104,7 +102,7 @@ def stats_document(summary: Summary) -> dict[str, Any]:
         "format_version": STATS_FORMAT_VERSION,
         "plan_fingerprint": summary.blueprint.fingerprint,
         "splits": {split: _fields_json(fields) for split, fields in summary.statistics.items()},
-        "densities": {split: densities_to_json(item.densities) for split, item in summary.outcomes.items()},
+        "densities": {split: densities_to_json(item.densities) for split, item in summary.fates_by_split.items()},
     }
 
 

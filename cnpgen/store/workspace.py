@@ -1,16 +1,18 @@
-"""The folder of a dataset that is being made: whose it is, opening it, and clearing what is to be replaced."""
+"""The folder in which a dataset is made: what is there, whose it is, and what may be done with it."""
 
 import errno
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import INFORMATIONAL, Blueprint, load_blueprint, to_json, write_plan
+from cnpgen.store.blueprint import INFORMATIONAL, Blueprint, load_blueprint, to_json, write_blueprint
 from cnpgen.store.files.atomic import machine_error, read_file, sweep
+from cnpgen.store.files.documents import Difference, differences
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
@@ -18,24 +20,131 @@ _SHARD = re.compile(r"shard-\d{5,}\.(h5|json)")
 _MARK = re.compile(rb'\{\s*"format": "cnpgen-')
 
 
-def check_place(folder: Path) -> None:
+@dataclass(frozen=True)
+class Workspace:
+    """A folder for a dataset as it was found; others may change it meanwhile.
+
+    Attributes:
+        folder: The folder.
+        there: The folder, or where it is missing the nearest one above it that is there.
+        holds: What is in it: "nothing", "a dataset", finished or not, damaged or not, "a file" in its place, or
+            "something else".
+        rows: Whether there are shards, or records of shards.
+        blueprint: The blueprint in it; None where there is none that can be read.
+        damage: Why the blueprint cannot be read; empty where it can.
+    """
+
+    folder: Path
+    there: Path
+    holds: Literal["nothing", "a dataset", "a file", "something else"]
+    rows: bool = False
+    blueprint: Blueprint | None = None
+    damage: str = ""
+
+
+def find_workspace(folder: Path) -> Workspace:
+    """Look at a folder in which a dataset is to be made.
+
+    Raises:
+        MachineError: The system would not let us look.
+    """
+    try:
+        above = [folder.absolute(), *folder.absolute().parents]
+        there = next(path for path in above if path.exists())
+        if not there.is_dir():
+            return Workspace(folder, there, "a file")
+        if there != above[0] or all(item.name == WORK for item in folder.iterdir()):
+            return Workspace(folder, there, "nothing")
+    except OSError as error:
+        raise machine_error("write to", folder, error) from error
+    if not is_dataset(folder):
+        return Workspace(folder, there, "something else")
+    rows = any(_shard_files(folder))
+    try:
+        return Workspace(folder, there, "a dataset", rows, load_blueprint(folder))
+    except DatasetError as error:
+        return Workspace(folder, there, "a dataset", rows, damage=str(error))
+
+
+def check_place(workspace: Workspace) -> None:
     """Refuse a folder in which no dataset can be made, before any work is done for it.
 
     Raises:
         UsageError: It is a file, lies below one, or holds something that is not a dataset of cnpgen.
         MachineError: It cannot be written.
     """
+    if workspace.holds == "a file":
+        raise UsageError(f"{workspace.there} is a file, not a folder; choose another --out")
+    if workspace.holds == "something else":
+        raise UsageError(f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another --out")
+    if not os.access(workspace.there, os.W_OK | os.X_OK):
+        raise machine_error("write to", workspace.folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+
+
+def is_begun(workspace: Workspace, blueprint: Blueprint) -> bool:
+    """Whether a folder has the blueprint already; if not, it may be written.
+
+    Raises:
+        UsageError: It has rows of another blueprint.
+        DatasetError: It has rows, and its blueprint is damaged.
+    """
+    found = workspace.blueprint
+    if found is not None and found.fingerprint == blueprint.fingerprint:
+        return True
+    if workspace.rows and found is None:
+        raise DatasetError(f"{workspace.damage}; --force replaces the whole dataset")
+    if workspace.rows and found is not None:
+        raise UsageError(f"{workspace.folder} {_refusal(found, blueprint)}")
+    return False
+
+
+def open_workspace(folder: Path, blueprint: Blueprint, *, force: bool = False) -> Blueprint:
+    """Create the folder with its blueprint, or make sure that it holds the same blueprint already.
+
+    The folder is looked at anew: while kernels were built another process may have begun the dataset in it. A blueprint
+    of which nothing was made yet gives way to the new one: it costs nothing.
+
+    Args:
+        folder: The folder.
+        blueprint: What is to be made.
+        force: Whether to delete the dataset that is in the folder.
+
+    Returns:
+        The blueprint in the folder: the same, but perhaps written by another version of cnpgen, as its shards say.
+
+    Raises:
+        UsageError: The folder holds something else.
+        MachineError: The folder cannot be written.
+        DatasetError: The blueprint in the folder is damaged.
+    """
+    workspace = find_workspace(folder)
+    check_place(workspace)
+    workspace = _cleared(workspace) if force else workspace
+    begun = is_begun(workspace, blueprint)
     try:
-        above = [folder.absolute(), *folder.absolute().parents]
-        there = next(path for path in above if path.exists())
-        if not there.is_dir():
-            raise UsageError(f"{there} is a file, not a folder; choose another --out")
-        if there == above[0] and not is_dataset(folder) and any(item.name != WORK for item in folder.iterdir()):
-            raise UsageError(f"{folder} is not empty and not a dataset of cnpgen; choose another --out")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in () if begun else _SUMMARIES:
+            (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("write to", folder, error) from error
+    if not begun:
+        write_blueprint(folder, blueprint)
+    sweep(folder / WORK)
+    return workspace.blueprint if begun and workspace.blueprint else blueprint
+
+
+def require_blueprint(folder: Path, blueprint: Blueprint) -> None:
+    """Make sure that the folder still belongs to a blueprint: another process may have replaced the dataset meanwhile.
+
+    Raises:
+        UsageError: It has another blueprint now, or none.
+    """
+    try:
+        mine = blueprint.fingerprint.encode() in read_file(folder / PLAN)
+    except DatasetError:
+        mine = False
+    if not mine:
+        raise UsageError(f"{folder} was given to another dataset while this one was made; choose another --out")
 
 
 def is_dataset(folder: Path) -> bool:
@@ -57,72 +166,27 @@ def _shard_files(folder: Path) -> Iterator[Path]:
     return (path for path in folder.glob("*/shard-*.*") if _SHARD.fullmatch(path.name))
 
 
-def open_workspace(folder: Path, blueprint: Blueprint) -> None:
-    """Create the folder with its plan, or make sure that it holds the same plan already.
-
-    A plan of which nothing was made yet gives way to the new one: it costs nothing.
-
-    Raises:
-        UsageError: The folder holds something else.
-        MachineError: The folder cannot be written.
-        DatasetError: The plan in the folder is damaged.
-    """
-    check_place(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise machine_error("create", folder, error) from error
-    if not holds_plan(folder, blueprint):
-        for name in _SUMMARIES:
-            (folder / name).unlink(missing_ok=True)
-        write_plan(folder, blueprint)
-    sweep(folder / WORK)
-
-
-def holds_plan(folder: Path, blueprint: Blueprint) -> bool:
-    """Whether a folder has the plan already; if not, it may be written.
-
-    Raises:
-        UsageError: It has rows of another plan.
-        DatasetError: It has rows, and its plan is damaged.
-    """
-    used = any(_shard_files(folder))
-    try:
-        found = load_blueprint(folder)
-    except DatasetError as error:
-        if used:
-            raise DatasetError(f"{error}; --force replaces the whole dataset") from error
-        return False
-    if found.fingerprint == blueprint.fingerprint:
-        return True
-    if used:
-        raise UsageError(f"{folder} {_refusal(found, blueprint)}")
-    return False
-
-
 def _refusal(found: Blueprint, wanted: Blueprint) -> str:
     """Say why a dataset cannot become another one, and what to do."""
-    differences = _differences(to_json(found), to_json(wanted))
-    if not differences:
+    same = (*INFORMATIONAL, "splits")
+    old, new = ({key: value for key, value in to_json(item).items() if key not in same} for item in (found, wanted))
+    changed = dict.fromkeys(_setting(difference) for difference in differences(old, new))
+    if not changed:
         return (
             f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; a dataset does not grow or shrink,"
             " but the rows that both sizes have are the same: choose another --out, or replace it with --force"
         )
-    return f"holds another dataset ({'; '.join(differences[:3])}); choose another --out, or replace it with --force"
+    return f"holds another dataset ({'; '.join([*changed][:3])}); choose another --out, or replace it with --force"
 
 
-def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Name the settings, besides the number of rows, in which two plans differ."""
-    found = []
-    for key in old:
-        if key in INFORMATIONAL or key == "splits" or old[key] == new[key]:
-            continue
-        if key == "recipe_sha256":
-            found.append("another recipe")
-            continue
-        plain = isinstance(old[key], str | int)
-        found.append(f"{key.replace('_', ' ')} {old[key]} instead of {new[key]}" if plain else f"another {key}")
-    return found
+def _setting(difference: Difference) -> str:
+    """Name a setting in which two blueprints differ, with its values where they say something."""
+    key, _, rest = difference.key.partition(".")
+    if key == "recipe_sha256":
+        return "another recipe"
+    if rest or isinstance(difference.found, list):
+        return f"another {key}"
+    return f"{key.replace('_', ' ')} {difference.found} instead of {difference.wanted}"
 
 
 def _sizes(blueprint: Blueprint) -> str:
@@ -130,30 +194,16 @@ def _sizes(blueprint: Blueprint) -> str:
     return f"{sum(blueprint.splits.values()):,} rows ({splits})"
 
 
-def require_plan(folder: Path, blueprint: Blueprint) -> None:
-    """Make sure that the folder still belongs to a plan: another process may have replaced the dataset meanwhile.
-
-    Raises:
-        UsageError: It has another plan now, or none.
-    """
-    try:
-        mine = blueprint.fingerprint.encode() in read_file(folder / PLAN)
-    except DatasetError:
-        mine = False
-    if not mine:
-        raise UsageError(f"{folder} was given to another dataset while this one was made; choose another --out")
-
-
-def clear_dataset(folder: Path) -> None:
+def _cleared(workspace: Workspace) -> Workspace:
     """Delete the dataset in a folder, and nothing that is not part of one.
 
     Raises:
-        UsageError: The folder holds something that is not a dataset of cnpgen.
+        UsageError: The folder holds something that is not part of the dataset.
         MachineError: A file cannot be deleted.
     """
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    splits = check_clearable(folder)
+    if workspace.holds != "a dataset":
+        return workspace
+    folder, splits = workspace.folder, check_clearable(workspace)
     try:
         (folder / MANIFEST).unlink(missing_ok=True)  # first: what is half deleted must not look complete
         for split in splits:
@@ -165,32 +215,27 @@ def clear_dataset(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error
+    return Workspace(folder, workspace.there, "nothing")
 
 
-def check_clearable(folder: Path) -> list[Path]:
+def check_clearable(workspace: Workspace) -> list[Path]:
     """Refuse a folder that holds anything else than a dataset; return the folders of its splits.
+
+    Those are the splits that the blueprint names, or, where it cannot be read, the folders with shards.
 
     Raises:
         UsageError: It does.
     """
-    if not is_dataset(folder):
-        raise UsageError(f"{folder} is not a dataset of cnpgen: --force deletes only those; choose another --out")
-    splits = _splits(folder)
-    foreign = _foreign(folder, splits)
-    if foreign:
+    folder, blueprint = workspace.folder, workspace.blueprint
+    named = sorted({path.parent for path in _shard_files(folder)})
+    if blueprint is not None:
+        named = [folder / split for split in blueprint.splits]
+    splits = [split for split in named if split.is_dir()]
+    if foreign := _foreign(folder, splits):
         raise UsageError(
             f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
         )
     return splits
-
-
-def _splits(folder: Path) -> list[Path]:
-    """List the folders of the splits: those that the plan names, or, where it is damaged, those with shards."""
-    try:
-        splits = [folder / split for split in load_blueprint(folder).splits]
-    except DatasetError:
-        splits = sorted({path.parent for path in _shard_files(folder)})
-    return [split for split in splits if split.is_dir()]
 
 
 def _foreign(folder: Path, splits: list[Path]) -> Path | None:

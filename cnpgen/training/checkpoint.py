@@ -2,12 +2,13 @@
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.store.files.documents import differences
 from cnpgen.store.files.sealed import read_sealed, write_sealed
 from cnpgen.training.state import State, from_content, to_content
 
@@ -57,11 +58,11 @@ class Checkpoints:
             found, state = json.loads(content.texts["identity"]), from_content(content)
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
-        changed = list(differences(found, self.identity))
+        changed = list(map(str, differences(found, self.identity)))
         if changed:
             raise UsageError(
                 f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to go"
-                " on with it, or --force to throw it away"
+                " on with it, or force=True to throw it away"
             )
         return state
 
@@ -85,12 +86,3 @@ class Checkpoints:
     def remove(self) -> None:
         """Remove the file."""
         self.path.unlink(missing_ok=True)
-
-
-def differences(found: Any, mine: Any, key: str = "") -> Iterator[str]:
-    """Say where two JSON-able values differ, as dotted keys, with the values if they are short."""
-    if isinstance(found, dict) and isinstance(mine, dict):
-        for name in [*found, *(name for name in mine if name not in found)]:
-            yield from differences(found.get(name), mine.get(name), f"{key}.{name}" if key else name)
-    elif found != mine:
-        yield f"{key} ({found!r}, now {mine!r})" if len(repr(found)) + len(repr(mine)) < 80 else key

@@ -25,10 +25,11 @@ def check_beside(out: Path) -> None:
         UsageError: There is such a file.
     """
     log, picture = out.with_suffix(LOG), out.with_suffix(PICTURE)
+    hint = "out= names another model, force=True replaces it"
     if log.exists() and not is_log(log):
-        raise UsageError(f"{log} is there and no training log: -o names another model, --force replaces it")
+        raise UsageError(f"{log} is there and no training log: {hint}")
     if picture.exists() and not log.exists():
-        raise UsageError(f"{picture} is there, and of no training run: -o names another model, --force replaces it")
+        raise UsageError(f"{picture} is there, and of no training run: {hint}")
 
 
 def sweep_beside(out: Path) -> None:

@@ -161,7 +161,7 @@ class Run:
         sums, step = state.sums, state.adam.step
         state.sums = Sums(np.zeros_like(sums.terms))
         if sums.lost > sums.steps * self.order.batch_size // 2:
-            raise MachineError(f"the loss of most plans is not finite at step {step}: try a smaller --learning-rate")
+            raise MachineError(f"the loss of most plans is not finite at step {step}: try a smaller learning_rate=")
         return {
             "step": step,
             "epoch": round(step / self.order.batches, 3),

@@ -13,8 +13,8 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, save_model
 from cnpgen.planner.requests import record_of
 from cnpgen.schema.arguments import integer
-from cnpgen.store.files.documents import plain
-from cnpgen.training.checkpoint import Checkpoints, differences
+from cnpgen.store.files.documents import differences, plain
+from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.data import TrainingData, open_training_data
 from cnpgen.training.files import CHECKPOINT, LOG, check_beside, check_out, sweep_beside
 from cnpgen.training.log import TrainingLog
@@ -148,13 +148,13 @@ def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: TrainingLog, 
 
 def _finished(job: _Job) -> Trained:
     """Return the model that is there if it is the one that was asked for."""
-    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with --force"
+    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with force=True"
     try:
         model = load_model(path)
     except DatasetError as error:
         raise UsageError(f"{path} exists and is no model ({error}): {hint}") from error
     found = {name: model.training.get(name) for name in identity}
-    changed = list(differences(found, identity))
+    changed = list(map(str, differences(found, identity)))
     if changed:
         raise UsageError(f"{path} is another model, it differs in {', '.join(changed[:4])}: {hint}")
     return Trained(model, path, model.training["score"], made=False)

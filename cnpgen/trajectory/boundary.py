@@ -1,7 +1,8 @@
 """Boundary control points: position, velocity and acceleration at the ends, exactly (paper, Appendix A)."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,14 @@ from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 
 Array = NDArray[np.float64]
+
+
+class Scaling(Protocol):
+    """What rows were normalised with, as far as it is needed here."""
+
+    def denormalize(self, rows: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Bring rows back into their units."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,28 @@ class Boundary:
     goal_q: Array
     goal_dq: Array
     goal_ddq: Array | None = None
+
+    @classmethod
+    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | None) -> "Boundary":
+        """Take the boundary conditions out of a batch of rows, whatever else is in it.
+
+        Args:
+            batch: Field name -> values, shape (N, n): a batch, rows, or any mapping; arrays, or tensors.
+            normalization: What the rows were normalised with, ``dataset.normalization`` for batches, which are by
+                default; None for rows in their units.
+
+        Raises:
+            UsageError: A boundary condition is not among the fields.
+        """
+        names = [each.name for each in fields(cls)]
+        missing = [name for name in names if name not in batch and name != "goal_ddq"]
+        if missing:
+            raise UsageError(f"the batch lacks {', '.join(missing)}: it has the fields {', '.join(map(str, batch))}")
+        rows = {name: batch[name] for name in names if name in batch}
+        return cls(**(rows if normalization is None else normalization.denormalize(rows)))
+
+    def __repr__(self) -> str:
+        return f"<Boundary of shape {np.shape(self.start_q)}>"
 
     @property
     def fixed_at_goal(self) -> int:

@@ -37,6 +37,9 @@ class States:
     jerk: Array
     rate: Array
 
+    def __repr__(self) -> str:
+        return f"<States of shape {np.shape(self.q)}>"
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -61,6 +64,9 @@ class Motion:
             raise UsageError(f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}")
         if min(path[1], rate[1]) <= self.degree:
             raise UsageError(f"splines of degree {self.degree} need at least {self.degree + 1} control points")
+
+    def __repr__(self) -> str:
+        return f"<Motion of degree {self.degree}: path {np.shape(self.path)}, rate {np.shape(self.rate)}>"
 
     def __len__(self) -> int:
         return len(self.path)

@@ -10,8 +10,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
-from cnpgen.make.shards import blocks_of, shard_columns
-from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.make.shards import Job, blocks_of, prepare, shard_columns
 from cnpgen.store.blueprint import REVISION, Blueprint, ShardTask
 from cnpgen.store.check import Finding
 from cnpgen.store.reader import StoredDataset
@@ -43,7 +42,7 @@ def make_again(folder: Path, blueprint: Blueprint, tasks: list[ShardTask], count
 
     Args:
         folder: The dataset.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         tasks: The shards whose blocks may be chosen.
         count: How many blocks to choose; all of them if there are fewer.
 
@@ -58,7 +57,7 @@ def make_again(folder: Path, blueprint: Blueprint, tasks: list[ShardTask], count
     chosen = np.random.default_rng().permutation(len(pieces))[:count]
     identical, findings = 0, []
     with restored(blueprint) as recipe:
-        prepared = PreparedPipeline(recipe.pipeline, backend=backend, cache_folder=cache_folder, dtype=blueprint.dtype)
+        prepared = prepare(Job(folder, blueprint, recipe.pipeline, backend, cache_folder))
         if prepared.block_rows != size:
             raise UsageError(f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}")
         for task, block in (pieces[index] for index in chosen):
@@ -107,6 +106,6 @@ def _explanation(blueprint: Blueprint, recipe: DatasetRecipe) -> str:
     other = [f"{name} {was} -> {now.get(name)}" for name, was in blueprint.versions.items() if now.get(name) != was]
     if blueprint.revision != REVISION:
         other.append(f"revision of the generator {blueprint.revision} -> {REVISION}")
-    if recipe_digest(recipe) != blueprint.recipe_sha256:  # the plan's own recipe, so that only code can be different
+    if recipe_digest(recipe) != blueprint.recipe_sha256:  # its own recipe: only code can differ
         other.append("the code of its plug-ins has changed")
     return f" (made with other versions: {', '.join(other)})" if other else ""

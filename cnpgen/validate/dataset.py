@@ -82,9 +82,7 @@ class ValidationReport:
                 for check in self.deep.checks
             ]
         if self.plans:
-            lines.append(
-                f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid"
-            )
+            lines.append(f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
         if self.wanted:
             lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
         advice = dict.fromkeys(finding.advice for finding in self.findings if finding.advice and not finding.note)
@@ -119,7 +117,7 @@ def validate_dataset(
     Raises:
         UsageError: There is no folder, or an argument makes no sense.
         DatasetError: It holds no dataset.
-        RecipeError: The recipe in the plan does not fit this version of cnpgen.
+        RecipeError: The recipe in the blueprint does not fit this version of cnpgen.
         PluginError: It needs packages that are not installed, for what was asked for.
         MachineError: The disk fails, or the backend that made the dataset does not work here and blocks are to be
             made again.

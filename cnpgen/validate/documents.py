@@ -1,4 +1,4 @@
-"""What the documents of a dataset say together: the recipe in its plan, and whether they agree beyond checksums."""
+"""What the documents of a dataset say together: the recipe in its blueprint, and whether the statistics add up."""
 
 import tempfile
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_docum
 
 
 def check_recipe(blueprint: Blueprint) -> list[Finding]:
-    """Check that the digest of the recipe in a plan is that of the recipe in it."""
+    """Check that the digest of the recipe in a blueprint is that of the recipe in it."""
     try:
         found = resolved_digest(blueprint.recipe["pipeline"], str(blueprint.robot["urdf"]).encode())
     except (KeyError, TypeError, AttributeError):
@@ -44,7 +44,7 @@ def check_statistics(folder: Path, blueprint: Blueprint) -> list[Finding]:
 
 @contextmanager
 def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
-    """Rebuild the recipe from a plan, its URDF in a temporary folder that is gone when the block ends.
+    """Rebuild the recipe from a blueprint, its URDF in a temporary folder that is gone when the block ends.
 
     Raises:
         RecipeError: It does not fit this version of cnpgen.

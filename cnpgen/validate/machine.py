@@ -209,7 +209,7 @@ def _check_cores(found: _Findings) -> tuple[int, int]:
     except Exception:  # noqa: BLE001 - reported by _check_libraries
         granted = available
     if granted < available:
-        found.notes.append(f"this container may use {granted} of {available} cores: run with --workers {granted}")
+        found.notes.append(f"this container may use {granted} of {available} cores: run with workers={granted}")
     return min(granted, available), present
 
 
@@ -292,6 +292,6 @@ def _check_disk(found: _Findings) -> int:
         return 0
     if free < ENOUGH_DISK:
         found.notes.append(
-            f"only {free / 1e6:,.0f} MB are free in {Path.cwd()}: choose another --out for large datasets"
+            f"only {free / 1e6:,.0f} MB are free in {Path.cwd()}: choose another out= for large datasets"
         )
     return free

@@ -18,10 +18,10 @@ SUMMATION = 1e-9  # relative: what sums of the same numbers may differ by from o
 
 
 def check_numbers(blueprint: Blueprint, task: ShardTask, columns: Columns, record: ShardRecord) -> list[str]:
-    """Check the rows of a shard against its plan and its record.
+    """Check the rows of a shard against its blueprint and its record.
 
     Args:
-        blueprint: The dataset's plan.
+        blueprint: The blueprint of the dataset.
         task: The shard.
         columns: All its fields, shape (rows, width) or (rows,).
         record: What is recorded of it.
@@ -39,8 +39,8 @@ def check_numbers(blueprint: Blueprint, task: ShardTask, columns: Columns, recor
             problems.append(f"hit_speed is above hit_speed_max: {_rows(faster, task)}")
     if not np.array_equal(columns["sample_id"], task.first_row + np.arange(task.rows)):
         problems.append("sample_id does not count the rows of the split")
-    if int(columns["attempts"].sum()) != record.outcome.tried:
-        problems.append(f"attempts sum to {columns['attempts'].sum()}, but {record.outcome.tried} draws are recorded")
+    if int(columns["attempts"].sum()) != record.fates.tried:
+        problems.append(f"attempts sum to {columns['attempts'].sum()}, but {record.fates.tried} draws are recorded")
     return problems
 
 

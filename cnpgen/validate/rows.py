@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, counted
+from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.machine.workers import share_out
-from cnpgen.make.certify import PlanCheck, check_plans
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.check import DELETE, Finding
@@ -50,7 +50,7 @@ def check_rows(
 
     Args:
         folder: The dataset.
-        blueprint: Its plan.
+        blueprint: Its blueprint.
         tasks: The shards to read.
         workers: Processes.
         progress: Called with the rows of every shard that was read.

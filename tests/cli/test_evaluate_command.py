@@ -115,7 +115,7 @@ def test_json_is_complete(run: Run, saved: Callable[[Plans], Path]) -> None:
 def test_a_file_without_plans_is_the_same_error_for_every_command(
     saved: Callable[[Plans], Path], capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
-    file = saved(plans_of(load("hit")).select(slice(0)))
+    file = saved(plans_of(load("hit"))[:0])
     assert main([words[0], str(file), *words[1:]]) == 1
     out, err = capsys.readouterr()
     assert (out, one_line(err)) == ("", f"cnpgen: error: no plans in {file}")

@@ -57,7 +57,7 @@ def test_a_message_is_what_ros_expects_of_a_joint_trajectory(run: Run, hits: Pat
     plan = load("hit")
     code, out, _ = run(hits, "--to", "joint-trajectory", "--rate", 250, "--plan", "1")
     assert (code, out) == (0, "hits-joint-trajectory\n")
-    (path,) = Path("hits-joint-trajectory").iterdir()
+    (path,) = Path("hits-joint-trajectory").glob("*.json")
     assert path.name == "plan_00001.json"
     message = json.loads(path.read_text(encoding="utf-8"))
     assert message["joint_names"] == list(plan.problem.robot.joints)
@@ -74,11 +74,11 @@ def test_a_message_is_what_ros_expects_of_a_joint_trajectory(run: Run, hits: Pat
 
 def test_plans_are_chosen_by_index_or_by_sample(run: Run, hits: Path) -> None:
     assert run(hits, "--to", "csv", "-o", "a", "--plan", "0,2-3")[0] == 0
-    assert sorted(path.name for path in Path("a").iterdir()) == [f"plan_0000{index}.csv" for index in (0, 2, 3)]
+    assert sorted(path.name for path in Path("a").glob("*.csv")) == [f"plan_0000{index}.csv" for index in (0, 2, 3)]
     assert run(hits, "--to", "csv", "-o", "b", "--sample", "11")[0] == 0
-    assert sorted(path.name for path in Path("b").iterdir()) == ["plan_00001.csv", "plan_00003.csv"]
+    assert sorted(path.name for path in Path("b").glob("*.csv")) == ["plan_00001.csv", "plan_00003.csv"]
     assert run(hits, "--to", "csv", "-o", "c", "--sample", "10", "--plan", "3")[0] == 0
-    assert sorted(path.name for path in Path("c").iterdir()) == ["plan_00000.csv", "plan_00003.csv"]
+    assert sorted(path.name for path in Path("c").glob("*.csv")) == ["plan_00000.csv", "plan_00003.csv"]
 
 
 def test_what_is_there_is_replaced_only_by_force(run: Run, hits: Path) -> None:
@@ -137,7 +137,7 @@ def test_plans_that_cannot_be_sampled_are_named_and_the_others_written(run: Run,
     )
     assert "cnpgen: left out: plan 2 (sample 2): the rate ds/dt is not positive throughout" in err
     assert last == f"exported {len(cases) - len(left_out)} plans of {len(cases)} at 50 Hz"
-    written = {path.name for path in Path("garbage-csv").iterdir()}
+    written = {path.name for path in Path("garbage-csv").glob("*.csv")}
     assert {"plan_00000.csv", "plan_00009.csv", "plan_00010.csv"} <= written
     assert len(written) == len(cases) - len(left_out)
 

@@ -24,7 +24,7 @@ from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.make.blueprint import MAX_ROWS
 from cnpgen.store.check import Finding
-from cnpgen.store.outcome import Fates
+from cnpgen.store.fates import Fates
 from cnpgen.validate.dataset import ValidationReport
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
@@ -321,7 +321,7 @@ def test_a_dry_run_says_what_becomes_of_a_plan_that_is_damaged_or_of_which_nothi
     folder = Path(shutil.copytree(hits, tmp_path / "hits"))
     content = (folder / "plan.json").read_bytes()
     (folder / "plan.json").write_bytes(content[:100])
-    assert "a damaged plan: would be refused without --force" in run(*MAKE, folder, "--dry-run")[1]
+    assert "a damaged plan.json: would be refused without --force" in run(*MAKE, folder, "--dry-run")[1]
     assert "would be replaced" in run(*MAKE, folder, "--dry-run", "--force")[1]
     shutil.rmtree(folder / "train")
     shutil.rmtree(folder / "validation")

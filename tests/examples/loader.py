@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.loader.batch import Batch
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.manifest import finalize
 from tests.examples.store import PLAN, make_columns, make_shard
 
@@ -19,11 +19,11 @@ ALL = ("start_q", "goal_p", "clearance", "sample_id")
 def make(folder: Path, *, finished: bool = True, **changes: Any) -> Path:
     """Make the store's example with other splits, shards, seed or dtype."""
     plan = replace(PLAN, **changes)
-    save_plan(folder, plan)
+    write_blueprint(folder, plan)
     for task in shards(plan):
         make_shard(folder, plan, task)
     if finished:
-        finalize(folder)
+        finalize(folder, plan)
     return folder
 
 

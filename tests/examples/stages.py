@@ -15,7 +15,7 @@ class Idle(Stage):
         return ()
 
     def prepare(self, context):
-        return lambda batch, random: None
+        return lambda draws, random: None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cnpgen.store.blueprint import Blueprint, ShardTask, save_plan, shards
+from cnpgen.store.blueprint import Blueprint, ShardTask, shards, write_blueprint
+from cnpgen.store.fates import DensityMap, Fates
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import finalize
-from cnpgen.store.outcome import DensityMap, Fates
 from cnpgen.store.record import ShardRecord, commit_shard
 
 FIELDS = (
@@ -53,7 +53,7 @@ def make_columns(task: ShardTask, dtype: str = "float64") -> dict[str, NDArray[A
     return columns | {"sample_id": np.arange(task.first_row, task.first_row + task.rows)}
 
 
-def make_outcome(task: ShardTask) -> Fates:
+def make_fates(task: ShardTask) -> Fates:
     density = DensityMap((0.6, 2.0), (-0.45, 0.45), np.full((4, 3), 2), np.full((4, 3), 1))
     return Fates(
         tried=2 * task.rows,
@@ -65,13 +65,13 @@ def make_outcome(task: ShardTask) -> Fates:
 
 
 def make_shard(folder: Path, plan: Blueprint, task: ShardTask) -> ShardRecord:
-    columns, outcome = make_columns(task, plan.dtype), make_outcome(task)
+    columns, fates = make_columns(task, plan.dtype), make_fates(task)
     return commit_shard(
         folder,
         plan,
         task,
         columns=columns,
-        outcome=outcome,
+        fates=fates,
         started=f"2026-11-21T02:02:0{2 + task.index}+01:00",
         seconds=0.5,
         versions=dict(plan.versions),
@@ -79,7 +79,7 @@ def make_shard(folder: Path, plan: Blueprint, task: ShardTask) -> ShardRecord:
 
 
 def make_shards(folder: Path, plan: Blueprint = PLAN) -> None:
-    save_plan(folder, plan)
+    write_blueprint(folder, plan)
     for task in shards(plan):
         make_shard(folder, plan, task)
 
@@ -89,7 +89,7 @@ def dataset(tmp_path: Path) -> Path:
     """A finished dataset."""
     folder = tmp_path / "two-shards-v1"
     make_shards(folder)
-    finalize(folder, notes="Some notes.")
+    finalize(folder, PLAN, notes="Some notes.")
     return folder
 
 
@@ -125,7 +125,7 @@ def test_a_finished_dataset_has_the_documented_files_and_no_others(dataset: Path
 def test_no_file_depends_on_where_the_dataset_is_or_when_it_was_finished(tmp_path: Path, dataset: Path) -> None:
     again = tmp_path / "elsewhere" / dataset.name
     make_shards(again, replace(PLAN))
-    finalize(again, notes="Some notes.")
+    finalize(again, PLAN, notes="Some notes.")
     for path in dataset.rglob("*"):
         if path.is_file():
             assert (again / path.relative_to(dataset)).read_bytes() == path.read_bytes(), path

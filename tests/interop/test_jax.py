@@ -194,6 +194,7 @@ MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": np.ones((1, 20))},
     "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
+    "weights: there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "start_tip must have shape (2, 3), got (3,)": {"start_tip": np.zeros(3)},
     "the shift of the quadrature nodes must be in [0, 1), got 1.5": {"shift": 1.5},
     "shift must be a finite number, got None": {"shift": None},

@@ -1,6 +1,9 @@
 """The bridge to torch, against torch itself."""
 
 # ruff: noqa: E402 - without the framework nothing else is imported
+import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -166,6 +169,80 @@ def test_training_resumes_after_any_number_of_used_batches(dataset: Dataset, wor
         if used % 2:
             wanted.set_epoch(1)  # changes nothing
         assert rows(DataLoader(wanted, batch_size=None, num_workers=workers)) == expected[used:]
+
+
+@pytest.mark.parametrize("used", range(1, 13))
+def test_a_state_dict_goes_on_with_the_next_batch_and_the_epochs_after_it(dataset: Dataset, used: int) -> None:
+    whole = [rows for epoch in range(3) for rows in ids(dataset.batches(8, fields=ALL, epoch=epoch))]
+    assert len(whole) == 18
+    interrupted, seen = BatchDataset(dataset.batches(8, fields=ALL)), []
+    while len(seen) < used:
+        for batch in interrupted:
+            seen.append(batch["sample_id"].tolist())
+            if len(seen) == used:
+                break
+    resumed = BatchDataset(dataset.batches(8, fields=ALL, seed=5))
+    resumed.load_state_dict(json.loads(json.dumps(interrupted.state_dict())))
+    rest: list[list[int]] = []
+    while len(rest) < 18 - used:
+        rest += rows(resumed)
+    assert seen + rest == whole
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_a_position_that_only_workers_know_is_refused_until_it_is_set_again(dataset: Dataset, context: str) -> None:
+    batches = dataset.batches(10, fields=ALL)
+    wanted = BatchDataset(batches)
+    loader = DataLoader(wanted, batch_size=None, num_workers=1, multiprocessing_context=context)
+    assert wanted.state_dict() == batches.state(batch=0)
+    next(iter(loader))
+    for ask in (wanted.state_dict, batches.state):
+        with pytest.raises(UsageError, match=r"workers .* took these batches.* state\(epoch=\.\.\., batch=\.\.\.\)"):
+            ask()
+    state = batches.state(epoch=2, batch=3)
+    wanted.load_state_dict(state)
+    assert batches.state() == wanted.state_dict() == state
+    assert rows(loader) == ids(dataset.batches(10, fields=ALL, epoch=2))[3:]
+    with pytest.raises(UsageError, match="workers"):
+        batches.state()
+    wanted.set_epoch(4)
+    assert batches.state() == batches.state(epoch=4)
+
+
+class AskedInWorker(BatchDataset):
+    """Asks for the position where it cannot be known."""
+
+    def __iter__(self) -> Any:
+        self.state_dict()
+        return super().__iter__()
+
+
+def test_a_worker_does_not_say_where_the_others_are(dataset: Dataset) -> None:
+    loader = DataLoader(AskedInWorker(dataset.batches(10)), batch_size=None, num_workers=1)
+    with pytest.raises(UsageError, match="worker of a DataLoader cannot say which batches were used"):
+        next(iter(loader))
+
+
+def test_torch_itself_is_left_as_it_was() -> None:
+    code = (
+        "from torch.utils.data._utils import collate; before = dict(collate.default_collate_fn_map);"
+        "import cnpgen.interop.torch; assert collate.default_collate_fn_map == before"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
+
+
+def test_fields_of_a_batch_may_be_replaced_by_others_of_their_shape(dataset: Dataset) -> None:
+    batch = to_torch(next(iter(dataset.batches(8, fields=ALL))))
+    batch.update({"start_q": 2 * batch["start_q"]}, extra=torch.zeros(1))
+    assert batch["extra"].shape == (1,)
+    with pytest.raises(UsageError, match=r"field 'start_q' of a batch must keep its shape \(8, 3\), got \(1, 8, 3\)"):
+        batch.update(start_q=batch["start_q"][None])
+
+
+def test_a_batch_of_tensors_is_printed_in_a_line(dataset: Dataset) -> None:
+    batch = to_torch(next(iter(dataset.batches(8, fields=ALL))))
+    said = "<batch of 8 rows, torch.float32 on cpu: start_q[3], goal_p[2], clearance, sample_id>"
+    assert repr(batch) == said
 
 
 def test_a_worker_in_the_middle_of_windows_gets_its_share(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,7 +413,8 @@ def test_weights_and_heights_may_be_arrays_and_any_float_type_is_taken(loss: Any
     of, given = loss("heavy-object", "float32"), plans("heavy-object", 3, torch.float32)
     expected = plan_loss(of, **given)[0]
     arrays = given | {name: given[name].numpy() for name in ("weights", "tops")}
-    for changed in (arrays, given | {"weights": given["weights"].tolist()}):
+    by_name = dict(zip(of.terms[1:], given["weights"].tolist(), strict=True))
+    for changed in (arrays, given | {"weights": given["weights"].tolist()}, given | {"weights": by_name}):
         torch.testing.assert_close(plan_loss(of, **changed)[0], expected)
     for dtype in (torch.bfloat16, torch.float16, torch.float64):
         path = given["path"].to(dtype).requires_grad_()
@@ -378,6 +456,7 @@ MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": torch.ones(1, 20)},
     "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
+    "weights: there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "path must be real numbers, got torch.complex64": {"path": torch.ones(2, 15, 6, dtype=torch.complex64)},
     "start_tip must have shape (2, 3), got (3,)": {"start_tip": torch.zeros(3)},
     "shift must be a finite number, got None": {"shift": None},

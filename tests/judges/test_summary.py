@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cnpgen.judges.plans import Margin, Metrics, Verdict, judge, summarise
+from cnpgen.judges.plans import Margin, Metrics, Reason, Verdict, judge, summarise
 from tests.examples.plans import bent, joined, load
 
 
@@ -45,6 +45,27 @@ def test_a_verdict_is_told_as_json():
     assert told["worst"]["part"] == "pedestal-2"
     assert told["worst"]["excess"] == pytest.approx(0.00305, abs=2e-5)
     assert set(told["margins"]) >= {"boundary velocity", "joint torque", "robot clearance", "tilt"}
+
+
+def test_a_reason_prints_in_the_same_way_whatever_it_is():
+    verdicts = verdicts_of_hits()
+    kinds = {type(verdict.reason) for verdict in verdicts}
+    assert kinds == {Reason, str}, "a reason of a constraint and others"
+    for verdict in verdicts:
+        text = str(verdict.reason)
+        assert (repr(verdict.reason), f"{verdict.reason}", f"{verdict.reason!r:.4}") == (
+            repr(text),
+            text,
+            repr(text)[:4],
+        )
+    assert str([*Reason]) == str([str(reason) for reason in Reason])
+
+
+def test_a_verdict_is_written_in_few_words():
+    right, bent_one, backwards, _ = verdicts_of_hits()
+    assert (repr(right), str(right)) == ("<Verdict: valid>", "valid")
+    assert str(bent_one) == f"{bent_one.reason} ({bent_one.worst})"
+    assert repr(backwards) == "<Verdict: rate not positive>"
 
 
 def test_a_margin_tells_value_bound_and_time():

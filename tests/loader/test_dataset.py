@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 import cnpgen
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.loader import frame
 from cnpgen.loader import shards as shards_module
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.record import ProblemRecord, record_problem
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
 from tests.examples.loader import ALL, columns, ids, make
@@ -47,6 +50,74 @@ def test_a_dataset_says_what_is_in_it(dataset: Dataset, folder: Path) -> None:
     assert list(dataset.fields) == list(ALL)
     assert dataset.fingerprint == open_dataset(folder).manifest["fingerprint"]  # type: ignore[index]
     assert repr(dataset) == f"<two-shards 1.0.0 in {folder}: 50 train, 10 validation>"
+
+
+def test_what_is_looked_at_is_printed_in_a_line(dataset: Dataset) -> None:
+    batches = dataset.batches(8, seed=3, fields=ALL)
+    batch = next(iter(batches))
+    layout = "start_q[3], goal_p[2], clearance, sample_id"
+    assert repr(batch) == f"<batch of 8 rows, float32: {layout}>"
+    assert repr(batches) == f"<batches of 8 of the 50 rows of split 'train', at seed 3, epoch 0, row 8: {layout}>"
+    assert repr(dataset["validation"]) == "<10 rows of split 'validation': start_q[3], goal_p[2]>"
+    assert repr(dataset.normalization) == "<means and deviations of start_q, goal_p, clearance>"
+
+
+def test_a_split_that_is_not_there_is_refused_with_those_that_are(dataset: Dataset, folder: Path) -> None:
+    said = "has no split 'val'.*: expected one of train, validation"
+    for ask in (
+        lambda: dataset["val"],
+        lambda: dataset.batches(8, split="val"),
+        lambda: dataset.rows("val", [0]),
+        lambda: dataset.frame("val"),
+        lambda: open_dataset(folder).read("val"),
+    ):
+        with pytest.raises(DatasetError, match=said):
+            ask()
+
+
+def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
+    found, problem = cnpgen.load_dataset(tiny("airhockey-hit")).problem, load_problem("airhockey")
+    assert ProblemRecord(found.recipe, found.urdf) == record_problem(problem)
+    assert found.urdf == problem.urdf_path.read_text()
+    assert repr(found) == "<problem airhockey of a dataset>"
+
+
+def test_a_dataset_that_does_not_say_its_problem_is_refused(dataset: Dataset) -> None:
+    with pytest.raises(DatasetError, match="the plan of two-shards lacks 'problem'"):
+        _ = dataset.problem
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("library", ["polars", "pandas"])
+def test_a_frame_has_a_column_per_joint_and_axis(dataset: Dataset, library: str) -> None:
+    pytest.importorskip(library)
+    table, rows = dataset.frame("train", fields=ALL, library=library), columns()
+    named = [("start_q", "j1"), ("start_q", "j2"), ("start_q", "j3"), ("goal_p", "x"), ("goal_p", "y")]
+    assert list(table.columns) == [*(".".join(pair) for pair in named), "clearance", "sample_id"]
+    assert table.shape == (50, 7)
+    for place, (name, column) in enumerate(named):
+        assert np.array_equal(table[f"{name}.{column}"].to_numpy(), rows[name][:, place - 3 * (name == "goal_p")])
+    assert np.array_equal(table["clearance"].to_numpy(), rows["clearance"])
+    assert table["sample_id"].to_numpy().dtype == np.int64
+    assert type(table).__module__.startswith(library)
+    assert list(dataset.frame("validation", library=library).columns) == list(table.columns)[:5]
+
+
+@pytest.mark.extended
+def test_a_frame_of_pandas_knows_its_units(dataset: Dataset) -> None:
+    pytest.importorskip("pandas")
+    units = dataset.frame("train", fields=["goal_p", "clearance"], library="pandas").attrs["units"]
+    assert units == {"goal_p.x": "m", "goal_p.y": "m", "clearance": "m"}
+
+
+def test_a_frame_of_another_library_or_of_none_is_refused(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="library must be one of polars, pandas, got 'spark'"):
+        dataset.frame("train", library="spark")
+    monkeypatch.setattr(frame, "find_spec", lambda name: None)
+    with pytest.raises(MachineError, match=r"a frame needs polars or pandas, .* pip install polars"):
+        dataset.frame("train")
+    with pytest.raises(MachineError, match=r"a frame needs pandas, .* pip install pandas"):
+        dataset.frame("train", library="pandas")
 
 
 def test_load_dataset_is_a_public_name() -> None:
@@ -130,7 +201,7 @@ def test_the_real_thing_is_loaded(tiny) -> None:
 
 
 def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards"):
         load_dataset(tmp_path)

@@ -231,7 +231,7 @@ def test_a_problem_may_be_named_and_nothing_else_is_one():
     assert PlanLoss("airhockey").terms == loss("airhockey").terms
     with pytest.raises(CnpgenError, match="did you mean 'airhockey'"):
         PlanLoss("airhokey")
-    with pytest.raises(CnpgenError, match=r"problem must be the name of a problem, .* got None"):
+    with pytest.raises(CnpgenError, match=r"problem must be a Problem, a ProblemRecord, or the name .* got None"):
         PlanLoss(None)
 
 
@@ -340,3 +340,27 @@ def test_a_constraint_that_says_nothing_about_training_is_a_term_with_a_gradient
     ends = [of(given.path + h * direction, given.rate, weights=weights, gradient=False).total for h in (1e-6, -1e-6)]
     expected = (ends[0] - ends[1]) / 2e-6
     np.testing.assert_allclose(np.einsum("kcn,kcn->k", value.path_gradient, direction), expected, rtol=1e-6)
+
+
+def test_weights_may_be_given_by_name_and_the_others_are_the_problems():
+    of, some = loss("airhockey"), batch("hit", 3)
+    given = some.path, some.rate
+    by_name = dict(zip(of.terms[1:], of.weights0.tolist(), strict=True)) | {"table": 3.0}
+    in_order = [by_name[name] for name in of.terms[1:]]
+    for weights in ({"table": 3.0}, {"table": np.float32(3)}, by_name):
+        np.testing.assert_array_equal(of(*given, weights=weights).total, of(*given, weights=in_order).total)
+    assert of.checked_weights({}).tolist() == of.checked_weights(of.weights0).tolist()
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"tabel": 3.0}, "weights: there is no constraint 'tabel' .did you mean 'table'.., expected some of joint-pos"),
+        ({"time": 3.0}, "weights: there is no constraint 'time'"),
+        ({"table": "much"}, "the weight of 'table' must be a finite number, got 'much'"),
+        ({"table": -1.0}, "the weight of 'table' must be a number that is not negative, got -1.0"),
+    ],
+)
+def test_weights_by_name_that_cannot_be_meant_are_refused(weights, message):
+    with pytest.raises(CnpgenError, match=message):
+        loss("airhockey").checked_weights(weights)

@@ -155,7 +155,7 @@ def test_whoever_watches_is_told_of_the_comparison_and_then_of_the_making(folder
         make_tiny(folder, begin=lambda *x: begun.append(x), progress=lambda *x: seen.append(x))
     assert begun == [("checking", folder, 660, 0), ("making", folder, 660, 560)]
     assert [rows for rows, _ in seen] == [250, 250, 100, 60, 100]
-    assert [outcome is None for _, outcome in seen] == [True] * 4 + [False]
+    assert [fates is None for _, fates in seen] == [True] * 4 + [False]
 
 
 def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_rest(folder, monkeypatch):

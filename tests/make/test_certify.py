@@ -12,7 +12,8 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
-from cnpgen.make.certify import NO_PLAN, CertifiedPlan, PlanCheck, certified, check_plans
+from cnpgen.judges.rows.plans import PlanCheck, check_plans
+from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.problems import load_problems, problems_of_rows
@@ -20,7 +21,7 @@ from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.refine import polish
+from cnpgen.refine import engine
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.task import Refined
 from cnpgen.store.files.atomic import file_sha256
@@ -78,13 +79,13 @@ def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) 
 
 
 def test_samples_without_a_plan_are_counted_under_their_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    solve, count = polish.refine_task, itertools.count()
+    solve, count = engine.refine_task, itertools.count()
 
     def fail_at_every_third(*arguments: Any) -> Refined:
         found = solve(*arguments)
         return replace(found, reason="off the table") if next(count) % 3 == 0 else found
 
-    monkeypatch.setattr(polish, "refine_task", fail_at_every_third)
+    monkeypatch.setattr(engine, "refine_task", fail_at_every_third)
     made = make_dataset("airhockey-hit", tmp_path / "out", n=8, certify=True, workers=1)
     outcome = open_dataset(made.folder).manifest["yield"]
     solved = next(count)

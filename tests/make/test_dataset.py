@@ -20,12 +20,13 @@ from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.shards import Job, make_shards, shard_columns
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
+from cnpgen.schema.catalogue import list_recipes
 from cnpgen.store.blueprint import load_blueprint, shards
+from cnpgen.store.fates import Fates
 from cnpgen.store.layout import MANIFEST, PLAN
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.outcome import Fates
 from cnpgen.store.record import pending
-from cnpgen.store.workspace import open_workspace
+from cnpgen.store.workspace import find_workspace, open_workspace
 from cnpgen.validate.dataset import validate_dataset
 from tests.conftest import SHIPPED, TINY_SHARD, columns_of, tiny_recipe
 from tests.examples.tiny_datasets import SHARDS, digests, make_tiny, snapshot
@@ -100,9 +101,7 @@ def test_another_seed_makes_other_rows(tiny: Callable[[str], Path], tmp_path):
 
 def test_a_pipeline_without_a_dataset_recipe_can_be_made(tmp_path):
     made = make_dataset("airhockey-hit", tmp_path / "a", n=50, workers=1)
-    from cnpgen.make.load import find_recipe
-
-    as_pipeline = make_dataset(find_recipe("pipeline", "airhockey-hit"), tmp_path / "b", n=50, workers=1)
+    as_pipeline = make_dataset(list_recipes("pipeline")["airhockey-hit"], tmp_path / "b", n=50, workers=1)
     assert as_pipeline.blueprint.splits == {"train": 45, "validation": 5}
     assert made.complete
     assert as_pipeline.complete
@@ -115,7 +114,7 @@ def test_the_default_folder_is_named_after_the_dataset_and_its_major_version(tmp
 
 
 def test_planning_writes_nothing(tmp_path):
-    job = draw_up(tiny_recipe("airhockey-hit"), tmp_path / "out")
+    job = draw_up(tiny_recipe("airhockey-hit"), find_workspace(tmp_path / "out"))
     assert sum(job.blueprint.splits.values()) == 660
     assert list(tmp_path.iterdir()) == []
 
@@ -125,9 +124,9 @@ def test_progress_is_told_of_every_shard_and_its_draws(tmp_path):
     begun: list[tuple[str, Path, int, int]] = []
     make_tiny(tmp_path / "out", progress=lambda *x: seen.append(x), begin=lambda *x: begun.append(x))
     assert [rows for rows, _ in seen] == [250, 250, 100, 60]
-    assert all(outcome.accepted == rows for rows, outcome in seen)
+    assert all(fates.accepted == rows for rows, fates in seen)
     assert begun == [("making", tmp_path / "out", 660, 0)]
-    total = sum(outcome.tried for _, outcome in seen)
+    total = sum(fates.tried for _, fates in seen)
     assert load_manifest(tmp_path / "out")["yield"]["tried"] == total
 
 
@@ -163,7 +162,7 @@ def test_parts_share_no_shard_and_leave_none(job, m):
 def test_force_would_delete_what_other_parts_made(tiny, tmp_path):
     folder = Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "out"))
     before = snapshot(folder)
-    with pytest.raises(UsageError, match="--force would delete what the other parts have made"):
+    with pytest.raises(UsageError, match="force=True would delete what the other parts have made"):
         make_tiny(folder, part=(0, 2), force=True)
     assert snapshot(folder) == before
 
@@ -180,12 +179,12 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
     honest = make.shard_columns
 
     def wrong(*arguments):
-        for columns, outcome in honest(*arguments):
+        for columns, fates in honest(*arguments):
             columns["start_q"][-1, 0] += 1e-6
-            yield columns, outcome
+            yield columns, fates
 
     monkeypatch.setattr(make, "shard_columns", wrong)
-    with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another --backend"):
+    with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend="):
         make_tiny(tmp_path / "out")
     assert not digests(tmp_path / "out")
 
@@ -202,7 +201,7 @@ def test_the_worst_violation_of_every_check_is_recorded(tiny):
 @pytest.fixture(scope="module")
 def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job") / "out"
-    job = draw_up(tiny_recipe("airhockey-hit"), folder, shard_size=TINY_SHARD)
+    job = draw_up(tiny_recipe("airhockey-hit"), find_workspace(folder), shard_size=TINY_SHARD)
     open_workspace(job.folder, job.blueprint)
     return job
 
@@ -224,12 +223,12 @@ def test_shards_are_the_rows_of_their_blocks_made_together_or_with_gaps(job):
     blocks = [prepared.block(plan.seed, "train", index) for index in range(3)]
     tasks = [task for task in shards(plan) if task.index != 3]
     assert {task.first_row // BLOCK_ROWS for task in tasks} == {0, 1, 2}
-    for task, (columns, outcome) in zip(tasks, shard_columns(prepared, plan, tasks), strict=True):
+    for task, (columns, fates) in zip(tasks, shard_columns(prepared, plan, tasks), strict=True):
         rows = slice(task.first_row, task.first_row + task.rows)
         for name, values in columns.items():
             expected = np.concatenate([block.columns[name] for block in blocks], axis=1)[:, rows].T
             np.testing.assert_array_equal(values, expected if values.ndim == 2 else expected[:, 0])
-        assert (outcome.accepted, outcome.tried) == (task.rows, columns["attempts"].sum())
+        assert (fates.accepted, fates.tried) == (task.rows, columns["attempts"].sum())
 
 
 @pytest.fixture

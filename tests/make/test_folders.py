@@ -94,10 +94,10 @@ def hopeless(monkeypatch) -> None:
     run = PreparedPipeline._round
 
     def rejected(self, random, size):
-        batch = run(self, random, size)
-        batch.stage = "test"
-        batch.reject(np.zeros(len(batch.alive), bool), "hopeless")
-        return batch
+        draws = run(self, random, size)
+        draws.stage = "test"
+        draws.reject(np.zeros(len(draws.alive), bool), "hopeless")
+        return draws
 
     monkeypatch.setattr(PreparedPipeline, "_round", rejected)
 

@@ -15,28 +15,28 @@ BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 STATES = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")]
 
 
-def judged(prepared: PreparedPipeline, batch: Round, **changes: np.ndarray) -> Round:
+def judged(prepared: PreparedPipeline, draws: Round, **changes: np.ndarray) -> Round:
     """Copy the survivors, change some columns and pass them through the gate."""
-    again = Round(len(batch.alive))
-    for name, values in batch.columns.items():
+    again = Round(len(draws.alive))
+    for name, values in draws.columns.items():
         again[name] = changes.get(name, values).copy()
-    acceptance(prepared.context, set(batch.columns))(again, random_generator(0, "train", 0))
+    acceptance(prepared.context, set(draws.columns))(again, random_generator(0, "train", 0))
     return again
 
 
-def fates(batch: Round) -> set[str]:
-    return {batch.reasons[k - 1] for k in set(batch.fate.tolist()) if k}
+def fates(draws: Round) -> set[str]:
+    return {draws.reasons[k - 1] for k in set(draws.fate.tolist()) if k}
 
 
-def roomy(prepared: PreparedPipeline, batch: Round) -> Round:
+def roomy(prepared: PreparedPipeline, draws: Round) -> Round:
     """Keep what is not on the verge of breaking a constraint already: one small change is to break one constraint."""
     robot = prepared.context.robot
     for end in ("start", "goal"):
-        room = np.minimum(batch[f"{end}_q"].T - robot.position_lower, robot.position_upper - batch[f"{end}_q"].T)
-        batch.reject(room.min(1) > 1e-3, "on a joint limit")
-        if f"{end}_clearance" in batch.columns:
-            batch.reject(batch[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
-    return batch
+        room = np.minimum(draws[f"{end}_q"].T - robot.position_lower, robot.position_upper - draws[f"{end}_q"].T)
+        draws.reject(room.min(1) > 1e-3, "on a joint limit")
+        if f"{end}_clearance" in draws.columns:
+            draws.reject(draws[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
+    return draws
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +47,8 @@ def rounds(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, Round]]:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_what_the_stages_made_passes(prepare: Prepare, rounds, name, backend):
-    _, batch = rounds[name]
-    again = judged(prepare(name, backend), batch)
+    _, draws = rounds[name]
+    again = judged(prepare(name, backend), draws)
     assert len(again.alive) == again.size > 40
     reasons = [constraint.reason for constraint in prepare(name).context.problem.constraint]
     extra = ["hit not along its direction"] if name.startswith("airhockey") else []
@@ -88,10 +88,10 @@ WRONG = [
 
 @pytest.mark.parametrize(("name", "column", "row", "amount", "reason"), WRONG)
 def test_one_wrong_number_is_rejected_under_its_constraint(rounds, name, column, row, amount, reason):
-    prepared, batch = rounds[name]
-    changed = batch[column].copy()
+    prepared, draws = rounds[name]
+    changed = draws[column].copy()
     changed[row] += amount
-    again = judged(prepared, batch, **{column: changed})
+    again = judged(prepared, draws, **{column: changed})
     assert len(again.alive) == 0
     expected = {"off the table", "tip not at its position"} if reason == "vertical or misplaced" else {reason}
     assert fates(again) <= expected | {"joint torque limit"} if column == "start_ddq" else fates(again) <= expected
@@ -101,14 +101,14 @@ def test_one_wrong_number_is_rejected_under_its_constraint(rounds, name, column,
 @pytest.mark.parametrize("name", SHIPPED)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_number_that_is_none_is_never_accepted_wherever_it_is(prepare: Prepare, rounds, name, backend, value):
-    _, batch = rounds[name]
-    columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in batch.columns]
-    places = [(column, row) for column in columns for row in range(len(batch[column]))]
-    assert len(places) <= len(batch.alive)
-    changes = {column: batch[column].copy() for column in columns}
+    _, draws = rounds[name]
+    columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in draws.columns]
+    places = [(column, row) for column in columns for row in range(len(draws[column]))]
+    assert len(places) <= len(draws.alive)
+    changes = {column: draws[column].copy() for column in columns}
     for draw, (column, row) in enumerate(places):
         changes[column][row, draw] = value
-    again = judged(prepare(name, backend), batch, **changes)
+    again = judged(prepare(name, backend), draws, **changes)
     accepted = [places[draw] for draw in again.alive.tolist() if draw < len(places)]
     assert accepted == []
     assert len(again.alive) == again.size - len(places)
@@ -125,20 +125,20 @@ def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
 
 def test_torques_beyond_their_limits_are_rejected(prepare: Prepare, rounds):
     for name in ("airhockey-replan", "heavy-object"):
-        prepared, batch = rounds[name]
+        prepared, draws = rounds[name]
         limits = replace(prepared.context.problem.limits, torque_scale=0.01)
         weak = prepare(replace(prepared.pipeline, problem=replace(prepared.context.problem, limits=limits)), "numpy")
-        again = judged(weak, batch)
+        again = judged(weak, draws)
         assert len(again.alive) < 0.1 * again.size
         assert fates(again) == {"joint torque limit"}
 
 
 def test_reasons_are_given_in_the_order_of_the_problem_s_constraints(rounds):
     """A row that breaks two constraints is counted once, under the first."""
-    prepared, batch = rounds["airhockey-replan"]
-    q, dq = batch["start_q"] + 10.0, batch["start_dq"] + 10.0
-    assert fates(judged(prepared, batch, start_q=q, start_dq=dq)) == {"joint position limit"}
-    assert fates(judged(prepared, batch, start_dq=dq)) == {"joint velocity limit"}
+    prepared, draws = rounds["airhockey-replan"]
+    q, dq = draws["start_q"] + 10.0, draws["start_dq"] + 10.0
+    assert fates(judged(prepared, draws, start_q=q, start_dq=dq)) == {"joint position limit"}
+    assert fates(judged(prepared, draws, start_dq=dq)) == {"joint velocity limit"}
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -9,12 +9,12 @@ import pytest
 from scipy.optimize import linprog
 
 from cnpgen.kernels.tape import Loop
-from cnpgen.make.load import find_recipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.braking import MAX_STEPS, STEP, SUSPECT, BrakingReach, braking_step, overshoot, tip_state
 from cnpgen.pipelines.stages.stage import Round
 from cnpgen.problems.constraints.table import Table
+from cnpgen.schema.catalogue import list_recipes
 from tests.conftest import Arm, Prepare, needs_compiler, run_stages, without_stages
 
 Array = np.ndarray
@@ -69,11 +69,11 @@ def fast(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
 @pytest.fixture(scope="module")
 def suspects(fast: tuple[PreparedPipeline, Round]) -> list[Case]:
     """States that a straight line of 80 ms carries off the table: starts, and goals reversed in time."""
-    prepared, batch = fast
+    prepared, draws = fast
     table, arm = prepared.context.constraint(Table), Arm(prepared.context.robot)
     cases = []
     for end, sign in (("start", 1.0), ("goal", -1.0)):
-        for q, dq in zip(batch[f"{end}_q"].T, sign * batch[f"{end}_dq"].T, strict=True):
+        for q, dq in zip(draws[f"{end}_q"].T, sign * draws[f"{end}_dq"].T, strict=True):
             position, velocity = np.array(arm.pose(q).translation), arm.velocity(q, dq)
             for axis, side, name, bound in EDGES:
                 edge = getattr(getattr(table, name), bound)
@@ -109,10 +109,10 @@ def test_braking_ends_where_an_independent_roll_out_ends(fast, suspects, kernels
 def test_states_that_are_not_suspect_can_brake(fast, kernels_of, fastest):
     """The roll-out is spared where a straight line of 80 ms ends a millimetre inside: so do all of those."""
     prepared, _ = fast
-    batch = run_stages(prepared, 20_000, seed=82)
+    draws = run_stages(prepared, 20_000, seed=82)
     table, tip, brake = kernels(prepared, fastest, kernels_of)
     for end, sign in (("start", 1.0), ("goal", -1.0)):
-        q, dq = batch[f"{end}_q"], sign * batch[f"{end}_dq"]
+        q, dq = draws[f"{end}_q"], sign * draws[f"{end}_dq"]
         position, velocity = tip(q, dq)
         for axis, side, name, bound in EDGES:
             edge = getattr(getattr(table, name), bound)
@@ -127,19 +127,19 @@ def test_states_that_are_not_suspect_can_brake(fast, kernels_of, fastest):
 
 
 def one(prepared: PreparedPipeline, q: Array, dq: Array) -> Round:
-    """A batch of one draw that starts with dq and arrives at rest."""
-    batch = Round(1)
+    """A draws of one draw that starts with dq and arrives at rest."""
+    draws = Round(1)
     for name, values in (("start_q", q), ("start_dq", dq), ("goal_q", q), ("goal_dq", 0 * dq)):
-        batch[name] = values[:, None].copy()
-    BrakingReach().prepare(prepared.context)(batch, random_generator(0, "train", 0))
-    return batch
+        draws[name] = values[:, None].copy()
+    BrakingReach().prepare(prepared.context)(draws, random_generator(0, "train", 0))
+    return draws
 
 
 def test_states_that_obviously_can_brake_pass_and_those_that_obviously_cannot_fail(fast):
-    prepared, batch = fast
+    prepared, draws = fast
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
-    at_edge = batch["start_q"][:, np.argmax(batch["start_xyz"][1])]  # a millimetre or so from y = 0.45
-    in_middle = batch["start_q"][:, np.argmin(np.abs(batch["start_xyz"] - [[0.95], [0.0], [0.16]]).sum(0))]
+    at_edge = draws["start_q"][:, np.argmax(draws["start_xyz"][1])]  # a millimetre or so from y = 0.45
+    in_middle = draws["start_q"][:, np.argmin(np.abs(draws["start_xyz"] - [[0.95], [0.0], [0.16]]).sum(0))]
     for q in (at_edge, in_middle):
         assert len(one(prepared, q, np.zeros(6)).alive) == 1
     jacobian = arm.jacobian(at_edge)[:3]
@@ -153,8 +153,8 @@ def test_states_that_obviously_can_brake_pass_and_those_that_obviously_cannot_fa
 
 
 def test_a_goal_is_a_start_reversed_in_time(fast):
-    prepared, batch = fast
-    q, dq = batch["start_q"], batch["start_dq"]
+    prepared, draws = fast
+    q, dq = draws["start_q"], draws["start_dq"]
     ends = []
     for start, goal in (("start", "goal"), ("goal", "start")):
         moving = Round(q.shape[1])
@@ -167,14 +167,14 @@ def test_a_goal_is_a_start_reversed_in_time(fast):
 
 
 def test_the_margin_is_a_distance_before_the_edge(fast, kernels_of, fastest):
-    prepared, batch = fast
+    prepared, draws = fast
     table, tip, brake = kernels(prepared, fastest, kernels_of)
-    excess = overshoot(tip, brake, table, batch["start_q"], batch["start_dq"], margin=0.02)
+    excess = overshoot(tip, brake, table, draws["start_q"], draws["start_dq"], margin=0.02)
     for margin in (0.0, 1e-3, 0.02):
-        again = Round(batch["start_q"].shape[1])
+        again = Round(draws["start_q"].shape[1])
         for name in ("start_q", "start_dq", "goal_q"):
-            again[name] = batch[name]
-        again["goal_dq"] = 0 * batch["goal_dq"]
+            again[name] = draws[name]
+        again["goal_dq"] = 0 * draws["goal_dq"]
         BrakingReach(margin=margin).prepare(prepared.context)(again, random_generator(0, "train", 0))
         np.testing.assert_array_equal(again.alive, np.flatnonzero(excess <= -margin))
     assert np.sum((excess > -0.02) & (excess <= 0)) > 0
@@ -182,7 +182,7 @@ def test_the_margin_is_a_distance_before_the_edge(fast, kernels_of, fastest):
 
 def braking_variant(folder: Path, name: str) -> Path:
     """Write the shipped pipeline with braking-reach in place of its ballistic rules."""
-    head, *stages = find_recipe("pipeline", name).read_text().split("[[stage]]")
+    head, *stages = list_recipes("pipeline")[name].read_text().split("[[stage]]")
     kept = [stage for stage in stages if "ballistic-reach" not in stage]
     path = folder / f"{name}-braking.toml"
     path.write_text("[[stage]]".join([head, *kept, '\nuse = "braking-reach"\nmargin = "1 mm"\n']))
@@ -193,11 +193,11 @@ def braking_variant(folder: Path, name: str) -> Path:
 def test_a_recipe_with_braking_reach_makes_blocks_and_rejects_less_than_the_ballistic_rule(
     prepare: Prepare, tmp_path, name
 ):
-    braking = prepare(load_pipeline(braking_variant(tmp_path, name)), "numpy").block(1, "train", 0, stop=1200).outcome
-    ballistic = prepare(name).block(1, "train", 0, stop=1200).outcome
+    braking = prepare(load_pipeline(braking_variant(tmp_path, name)), "numpy").block(1, "train", 0, stop=1200).fates
+    ballistic = prepare(name).block(1, "train", 0, stop=1200).fates
     lost = [
-        sum(count for reason, count in outcome.rejections.items() if "leaves the table" in reason or "brake" in reason)
-        for outcome in (braking, ballistic)
+        sum(count for reason, count in fates.rejections.items() if "leaves the table" in reason or "brake" in reason)
+        for fates in (braking, ballistic)
     ]
     assert braking.accepted == ballistic.accepted == 1200
     assert 0 < lost[0] / braking.tried < 0.5 * lost[1] / ballistic.tried

@@ -75,19 +75,19 @@ def test_coal_s_verdict_on_arm_and_object_agrees_with_the_verifier_s_distances(h
 
 def pair_at(heavy: PreparedPipeline, change: Callable[[Round], None]) -> Round:
     """Draws that passed every stage with 6 mm to spare, changed; judged by Coal on both ends."""
-    batch = run_stages(heavy, 200, seed=92)
-    batch.reject((batch["start_clearance"] > 6e-3)[0] & (batch["goal_clearance"] > 6e-3)[0], "close")
-    again = Round(len(batch.alive))
+    draws = run_stages(heavy, 200, seed=92)
+    draws.reject((draws["start_clearance"] > 6e-3)[0] & (draws["goal_clearance"] > 6e-3)[0], "close")
+    again = Round(len(draws.alive))
     for name in ("start_q", "goal_q", "start_xyz", "goal_xyz"):
-        again[name] = batch[name].copy()
+        again[name] = draws[name].copy()
     change(again)
     Collision(end="both", judge="coal").prepare(heavy.context)(again, random_generator(0, "train", 0))
     return again
 
 
 def test_an_object_that_stands_on_its_pedestal_is_no_collision(heavy):
-    batch = pair_at(heavy, lambda _: None)
-    assert len(batch.alive) == batch.size > 20
+    draws = pair_at(heavy, lambda _: None)
+    assert len(draws.alive) == draws.size > 20
 
 
 @pytest.mark.parametrize(("raised", "collides"), [(0.5e-3, False), (0.9e-3, False), (1.1e-3, True), (5e-3, True)])
@@ -95,18 +95,18 @@ def test_an_object_that_stands_on_its_pedestal_is_no_collision(heavy):
 def test_an_object_may_sink_into_its_pedestal_as_deep_as_the_problem_says(heavy, end, raised, collides):
     """The pedestal's top is where the object's bottom is said to be: saying it is higher raises the pedestal."""
 
-    def change(batch: Round) -> None:
-        batch[f"{end}_xyz"][2] += raised
+    def change(draws: Round) -> None:
+        draws[f"{end}_xyz"][2] += raised
 
-    batch = pair_at(heavy, change)
-    assert len(batch.alive) == (0 if collides else batch.size)
+    draws = pair_at(heavy, change)
+    assert len(draws.alive) == (0 if collides else draws.size)
 
 
 def test_the_clearance_is_stored_and_never_more_than_the_wrist_leaves(heavy):
     """The object's centre is 0.15 m above its pedestal, so a capsule of 0.14 m leaves a centimetre at most."""
-    batch = run_stages(heavy, 3000, seed=93)
+    draws = run_stages(heavy, 3000, seed=93)
     for end in ("start", "goal"):
-        clearance = batch[f"{end}_clearance"]
+        clearance = draws[f"{end}_clearance"]
         assert clearance.min() > 0
         assert clearance.max() <= 0.01 + 1e-9
     names = [field.name for field in heavy.fields]
@@ -114,9 +114,9 @@ def test_the_clearance_is_stored_and_never_more_than_the_wrist_leaves(heavy):
 
 
 def test_arms_in_collision_are_rejected_under_the_end_s_name(heavy):
-    batch = run_stages(heavy, 3000, seed=94)
-    counts = np.bincount(batch.fate, minlength=1 + len(batch.reasons))[1:]
-    fates = dict(zip(batch.reasons, counts.tolist(), strict=True))
+    draws = run_stages(heavy, 3000, seed=94)
+    counts = np.bincount(draws.fate, minlength=1 + len(draws.reasons))[1:]
+    fates = dict(zip(draws.reasons, counts.tolist(), strict=True))
     assert fates["arm in collision at the start"] > 100
     assert fates["arm in collision at the goal"] > 50
     assert fates["collision (Coal)"] == 0

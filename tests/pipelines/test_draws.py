@@ -53,26 +53,26 @@ def plain_rejection(stage: DrawPositions, count: int) -> dict[str, np.ndarray]:
 
 
 def test_positions_follow_the_law_of_plain_rejection_sampling(drawn):
-    prepared, batch = drawn
+    prepared, draws = drawn
     stage = stage_of(prepared, "DrawPositions")
     expected = plain_rejection(stage, DRAWS)
     if stage.min_distance:
-        kept = np.array([len(batch.alive), expected["start"].shape[1]])
+        kept = np.array([len(draws.alive), expected["start"].shape[1]])
         assert chi2_contingency([kept, DRAWS - kept]).pvalue > PROBABLE
     for end in ("start", "goal"):
         for axis in range(3):
-            assert ks_2samp(batch[f"{end}_xyz"][axis], expected[end][axis]).pvalue > PROBABLE
+            assert ks_2samp(draws[f"{end}_xyz"][axis], expected[end][axis]).pvalue > PROBABLE
     distances = [np.hypot(*(ends[1] - ends[0])[:2]) for ends in (
-        (batch["start_xyz"], batch["goal_xyz"]), (expected["start"], expected["goal"]),
+        (draws["start_xyz"], draws["goal_xyz"]), (expected["start"], expected["goal"]),
     )]  # fmt: skip
     assert ks_2samp(*distances).pvalue > PROBABLE
 
 
 def test_positions_before_the_rejection_are_uniform_in_their_boxes(drawn):
-    prepared, batch = drawn
+    prepared, draws = drawn
     stage = stage_of(prepared, "DrawPositions")
     for end, box in (("start", stage.start), ("goal", stage.goal)):
-        for axis, values in zip(box, batch.drawn[f"{end}_xyz"], strict=True):
+        for axis, values in zip(box, draws.drawn[f"{end}_xyz"], strict=True):
             assert values.shape == (DRAWS,)
             if axis.low == axis.high:
                 np.testing.assert_array_equal(values, axis.low)
@@ -81,16 +81,16 @@ def test_positions_before_the_rejection_are_uniform_in_their_boxes(drawn):
 
 
 def test_start_and_goal_are_independent_before_the_rejection(drawn):
-    _, batch = drawn
-    pairs = np.corrcoef(np.concatenate([batch.drawn["start_xyz"][:2], batch.drawn["goal_xyz"][:2]]))
+    _, draws = drawn
+    pairs = np.corrcoef(np.concatenate([draws.drawn["start_xyz"][:2], draws.drawn["goal_xyz"][:2]]))
     assert np.abs(pairs - np.eye(4)).max() < 4 / np.sqrt(DRAWS)
 
 
 def test_start_and_goal_are_never_closer_than_asked(drawn):
-    prepared, batch = drawn
-    apart = np.hypot(*(batch["goal_xyz"] - batch["start_xyz"])[:2])
+    prepared, draws = drawn
+    apart = np.hypot(*(draws["goal_xyz"] - draws["start_xyz"])[:2])
     assert apart.min() >= stage_of(prepared, "DrawPositions").min_distance
-    assert batch.reasons == ["too close together"]
+    assert draws.reasons == ["too close together"]
 
 
 def test_boxes_out_of_reach_are_a_mistake_in_the_recipe(prepare):
@@ -107,10 +107,10 @@ def test_boxes_out_of_reach_are_a_mistake_in_the_recipe(prepare):
 def test_guesses_are_uniform_and_independent_in_their_box(prepare, name):
     prepared = prepare(name)
     stage = stage_of(prepared, "StartIK")
-    guess, batch = stage.guess, Round(DRAWS)
-    batch["start_xyz"] = np.zeros((3, DRAWS))
-    stage.prepare(prepared.context)(batch, random_generator(13, "train", 0))
-    values = batch.drawn["guess_q"]
+    guess, draws = stage.guess, Round(DRAWS)
+    draws["start_xyz"] = np.zeros((3, DRAWS))
+    stage.prepare(prepared.context)(draws, random_generator(13, "train", 0))
+    values = draws.drawn["guess_q"]
     assert values.shape == (len(guess), DRAWS)
     for axis, row in zip(guess, values, strict=True):
         assert is_uniform(row, axis.low, axis.high)
@@ -140,20 +140,20 @@ def test_without_a_guess_the_search_starts_from_the_base_configuration(prepare):
 
 
 def test_hits_aim_at_the_target_with_uniform_noise(prepare):
-    batch = run_stages(prepare("airhockey-hit"), DRAWS, seed=14, until="HitAngleToGoal")
-    x, y, _ = batch["goal_xyz"]
-    noise = wrap(batch["hit_angle"][0] - np.arctan2(0.0 - y, 2.49 - x))
+    draws = run_stages(prepare("airhockey-hit"), DRAWS, seed=14, until="HitAngleToGoal")
+    x, y, _ = draws["goal_xyz"]
+    noise = wrap(draws["hit_angle"][0] - np.arctan2(0.0 - y, 2.49 - x))
     assert is_uniform(noise, -0.3 - 1e-12, 0.3 + 1e-12)
     assert abs(np.corrcoef(noise, y)[0, 1]) < 4 / np.sqrt(len(noise))
 
 
 def test_replanned_hits_are_uniform_in_the_cone_about_the_line_from_start_to_goal(prepare):
-    batch = run_stages(prepare("airhockey-replan"), DRAWS, seed=15, until="HitAngleInCone")
-    x, y = (batch["goal_xyz"] - batch["start_xyz"])[:2]
-    off = wrap(batch["hit_angle"][0] - np.arctan2(y, x))
+    draws = run_stages(prepare("airhockey-replan"), DRAWS, seed=15, until="HitAngleInCone")
+    x, y = (draws["goal_xyz"] - draws["start_xyz"])[:2]
+    off = wrap(draws["hit_angle"][0] - np.arctan2(y, x))
     assert is_uniform(off, -2 * np.pi / 3 - 1e-12, 2 * np.pi / 3 + 1e-12)
-    assert -np.pi <= batch["hit_angle"].min() < -3.1
-    assert 3.1 < batch["hit_angle"].max() <= np.pi
+    assert -np.pi <= draws["hit_angle"].min() < -3.1
+    assert 3.1 < draws["hit_angle"].max() <= np.pi
 
 
 def test_angles_are_wrapped_to_half_a_turn_on_either_side():
@@ -168,28 +168,28 @@ def test_angles_are_wrapped_to_half_a_turn_on_either_side():
 
 @pytest.mark.parametrize(("name", "fraction"), [("airhockey-hit", 0.5), ("airhockey-replan", 0.2)])
 def test_the_stated_fraction_of_hits_is_at_full_speed_and_the_rest_uniformly_slower(prepare, name, fraction):
-    batch = run_stages(prepare(name), DRAWS, seed=16, until="HittingVelocity")
-    speed, fastest = batch["hit_speed"][0], batch["hit_speed_max"][0]
+    draws = run_stages(prepare(name), DRAWS, seed=16, until="HittingVelocity")
+    speed, fastest = draws["hit_speed"][0], draws["hit_speed_max"][0]
     full = speed == fastest
     assert is_fraction(full, fraction)
     assert is_uniform((speed / fastest)[~full], 0.0, 1.0)
-    slow = np.abs(batch["goal_dq"]) / prepare(name).context.robot.velocity_limit[:, None]
+    slow = np.abs(draws["goal_dq"]) / prepare(name).context.robot.velocity_limit[:, None]
     np.testing.assert_array_less(slow.max(0)[~full], 1.0)
 
 
 def test_a_fifth_of_the_starts_is_exactly_at_rest(prepare):
-    batch = run_stages(prepare("airhockey-replan"), DRAWS, seed=17, until="TableVelocity")
-    rest = np.all(batch["start_dq"] == 0.0, axis=0)
+    draws = run_stages(prepare("airhockey-replan"), DRAWS, seed=17, until="TableVelocity")
+    rest = np.all(draws["start_dq"] == 0.0, axis=0)
     assert is_fraction(rest, 0.2)
-    np.testing.assert_array_equal(batch["start_tip_velocity"][:, rest], 0.0)
-    slowest = np.abs(batch["start_dq"][:, ~rest]).max(0)
+    np.testing.assert_array_equal(draws["start_tip_velocity"][:, rest], 0.0)
+    slowest = np.abs(draws["start_dq"][:, ~rest]).max(0)
     assert slowest.min() > 0
 
 
 def test_moving_starts_reach_a_uniform_fraction_of_their_tightest_limit(prepare):
     prepared = prepare("airhockey-replan")
-    batch = run_stages(prepared, DRAWS, seed=18, until="TableVelocity")
-    ratio = (np.abs(batch["start_dq"]) / prepared.context.robot.velocity_limit[:, None]).max(0)
+    draws = run_stages(prepared, DRAWS, seed=18, until="TableVelocity")
+    ratio = (np.abs(draws["start_dq"]) / prepared.context.robot.velocity_limit[:, None]).max(0)
     assert is_uniform(ratio[ratio > 0], 0.0, 1.0)
 
 
@@ -210,11 +210,11 @@ def test_accelerations_are_uniform_in_the_interval_that_the_limits_leave(prepare
 
 @pytest.mark.parametrize(("name", "ends"), [("airhockey-hit", ["start"]), ("heavy-object", ["start", "goal"])])
 def test_ends_at_rest_have_zero_velocity_and_acceleration(prepare, name, ends):
-    batch = run_stages(prepare(name), 300)
+    draws = run_stages(prepare(name), 300)
     for end in ends:
         for what in ("dq", "ddq"):
-            assert batch[f"{end}_{what}"].shape == batch["start_q"].shape
-            np.testing.assert_array_equal(batch[f"{end}_{what}"], 0.0)
+            assert draws[f"{end}_{what}"].shape == draws["start_q"].shape
+            np.testing.assert_array_equal(draws[f"{end}_{what}"], 0.0)
 
 
 # --- batches ----------------------------------------------------------------------------------------------------------
@@ -231,35 +231,35 @@ def test_a_stage_s_luck_does_not_depend_on_what_an_earlier_one_rejected():
 
 
 def test_every_rejected_draw_has_one_fate_and_leaves_every_column():
-    batch = Round(10)
-    batch["x"] = np.arange(10.0)[None]
-    batch.reject(np.arange(10) % 2 == 0, "odd")
-    batch["y"] = 2 * batch["x"]
-    batch.reject(batch["x"][0] > 3, "small")
-    batch.reject(np.ones(3, bool), "never")
-    assert batch.reasons == ["odd", "small", "never"]
-    assert batch.fate.tolist() == [2, 1, 2, 1, 0, 1, 0, 1, 0, 1]
-    assert batch.alive.tolist() == [4, 6, 8]
-    np.testing.assert_array_equal(batch["x"], [[4, 6, 8]])
-    np.testing.assert_array_equal(batch["y"], [[8, 12, 16]])
-    np.testing.assert_array_equal(batch.drawn["x"], [np.arange(10)])
-    assert "y" not in batch.drawn
+    draws = Round(10)
+    draws["x"] = np.arange(10.0)[None]
+    draws.reject(np.arange(10) % 2 == 0, "odd")
+    draws["y"] = 2 * draws["x"]
+    draws.reject(draws["x"][0] > 3, "small")
+    draws.reject(np.ones(3, bool), "never")
+    assert draws.reasons == ["odd", "small", "never"]
+    assert draws.fate.tolist() == [2, 1, 2, 1, 0, 1, 0, 1, 0, 1]
+    assert draws.alive.tolist() == [4, 6, 8]
+    np.testing.assert_array_equal(draws["x"], [[4, 6, 8]])
+    np.testing.assert_array_equal(draws["y"], [[8, 12, 16]])
+    np.testing.assert_array_equal(draws.drawn["x"], [np.arange(10)])
+    assert "y" not in draws.drawn
 
 
 def test_columns_of_the_wrong_length_are_refused():
-    batch = Round(4)
+    draws = Round(4)
     with pytest.raises(ValueError, match=r"column 'x' must have shape \(width, 4\), got \(2, 3\)"):
-        batch["x"] = np.zeros((2, 3))
+        draws["x"] = np.zeros((2, 3))
     with pytest.raises(ValueError, match="column 'x'"):
-        batch["x"] = np.zeros(4)
+        draws["x"] = np.zeros(4)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_stage_works_on_a_round_without_survivors(prepare, name):
     prepared = prepare(name)
-    batch, random = Round(64), random_generator(0, "train", 0)
+    draws, random = Round(64), random_generator(0, "train", 0)
     for stage in load_pipeline(name).stage:
         run = stage.prepare(prepared.context)
-        run(batch, random)
-        batch.reject(np.zeros(len(batch.alive), bool), "everything")
-    assert len(batch.alive) == 0
+        run(draws, random)
+        draws.reject(np.zeros(len(draws.alive), bool), "everything")
+    assert len(draws.alive) == 0

@@ -20,11 +20,11 @@ def test_where_there_are_two_local_optima_the_better_hitting_configuration_is_fo
 ) -> None:
     prepared = prepare("airhockey-replan")
     (stage,) = (each for each in prepared.pipeline.stage if isinstance(each, HittingConfiguration))
-    batch = Round(1)
+    draws = Round(1)
     for name in ("start_q", "goal_xyz"):
-        batch[name] = np.array(case[name])[:, None]
+        draws[name] = np.array(case[name])[:, None]
     direction = np.array(case["direction"])[:, None]
-    batch["hit_angle"] = np.arctan2(direction[1:], direction[:1])
-    stage.prepare(prepared.context)(batch, np.random.default_rng())
-    (found,) = prepared.context.kernels.load(objective)(batch["goal_q"], direction, batch["start_q"])
+    draws["hit_angle"] = np.arctan2(direction[1:], direction[:1])
+    stage.prepare(prepared.context)(draws, np.random.default_rng())
+    (found,) = prepared.context.kernels.load(objective)(draws["goal_q"], direction, draws["start_q"])
     assert found[0, 0] >= case["best"] - 1e-6

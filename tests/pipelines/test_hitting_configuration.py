@@ -58,15 +58,15 @@ def solved(request: pytest.FixtureRequest, prepare: Prepare) -> list[tuple[Searc
     """Searches, their first guesses by inverse kinematics, and our solutions."""
     prepared = prepare(request.param)
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
-    batch = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
-    n = len(batch.alive)
-    home = np.repeat(robot.base[:, None], n, axis=1) if request.param == "airhockey-hit" else batch["start_q"]
+    draws = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
+    n = len(draws.alive)
+    home = np.repeat(robot.base[:, None], n, axis=1) if request.param == "airhockey-hit" else draws["start_q"]
     first = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=False, max_step=0.4)
-    guess, _ = first(home, batch["goal_xyz"])
-    angle = batch["hit_angle"][0]
+    guess, _ = first(home, draws["goal_xyz"])
+    angle = draws["hit_angle"][0]
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     return [
-        (Search(robot, arm, batch["goal_xyz"][:, k], direction[:, k], home[:, k]), guess[:, k], batch["goal_q"][:, k])
+        (Search(robot, arm, draws["goal_xyz"][:, k], direction[:, k], home[:, k]), guess[:, k], draws["goal_q"][:, k])
         for k in range(min(n, DRAWS))
     ]
 
@@ -142,8 +142,8 @@ def test_the_search_improves_on_the_inverse_kinematics(solved):
 
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
 def test_hardly_a_draw_is_lost(prepare, name):
-    batch = run_stages(prepare(name), 20_000, seed=43, until="HittingConfiguration")
-    lost = [np.sum(batch.fate == 1 + k) for k, text in enumerate(batch.reasons) if text == "no hitting configuration"]
+    draws = run_stages(prepare(name), 20_000, seed=43, until="HittingConfiguration")
+    lost = [np.sum(draws.fate == 1 + k) for k, text in enumerate(draws.reasons) if text == "no hitting configuration"]
     assert sum(lost) < 20
 
 
@@ -157,12 +157,12 @@ def test_eliminated_joints_move_the_tip_in_all_directions_near_the_base(prepare)
 
 def test_a_step_is_never_longer_than_allowed(prepare):
     prepared = prepare("airhockey-replan")
-    batch = run_stages(prepared, 500, seed=45, until="HittingConfiguration")
+    draws = run_stages(prepared, 500, seed=45, until="HittingConfiguration")
     kernel = prepared.context.kernels.load(newton_step)
-    angle = batch["hit_angle"]
+    angle = draws["hit_angle"]
     direction = np.concatenate([np.cos(angle), np.sin(angle)])
-    following, length = kernel(batch["start_q"], batch["goal_xyz"], direction, batch["start_q"])
-    moved = np.linalg.norm(following - batch["start_q"], axis=0)
+    following, length = kernel(draws["start_q"], draws["goal_xyz"], direction, draws["start_q"])
+    moved = np.linalg.norm(following - draws["start_q"], axis=0)
     assert moved.max() <= 0.6 + 1e-12
     np.testing.assert_allclose(moved, np.minimum(length[0], 0.6), rtol=1e-9)
 
@@ -178,9 +178,9 @@ def test_no_draw_is_lost_at_a_joint_limit(prepare):
     prepared = prepare("airhockey-replan")
     robot, limited = prepared.context.robot, 0
     for seed in range(3):
-        batch = run_stages(prepared, 20_000, seed=seed, until="HittingConfiguration")
-        assert np.count_nonzero(batch.fate == 1 + batch.reasons.index("joint position limit at the goal")) == 0
-        limited += np.count_nonzero((sides(robot, batch["goal_q"].T) != 0).any(axis=1))
+        draws = run_stages(prepared, 20_000, seed=seed, until="HittingConfiguration")
+        assert np.count_nonzero(draws.fate == 1 + draws.reasons.index("joint position limit at the goal")) == 0
+        limited += np.count_nonzero((sides(robot, draws["goal_q"].T) != 0).any(axis=1))
     assert limited >= 3
 
 
@@ -193,14 +193,14 @@ def cramped(prepare: Prepare) -> list[tuple[Search, Array]]:
         context.robot, position_lower=np.maximum(low, base - 0.6), position_upper=np.minimum(high, base + 0.6)
     )
     kernels = replace(context.kernels, identity="cramped", arguments={**context.kernels.arguments, "robot": robot})
-    batch = run_stages(prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone")
-    batch.reject((np.abs(sides(robot, batch["start_q"].T)) < 2).all(axis=1), "elsewhere")
-    HittingConfiguration(near="start").prepare(replace(context, robot=robot, kernels=kernels))(batch, None)
-    angle, q, arm = batch["hit_angle"][0], batch["goal_q"], Arm(robot)
+    draws = run_stages(prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone")
+    draws.reject((np.abs(sides(robot, draws["start_q"].T)) < 2).all(axis=1), "elsewhere")
+    HittingConfiguration(near="start").prepare(replace(context, robot=robot, kernels=kernels))(draws, None)
+    angle, q, arm = draws["hit_angle"][0], draws["goal_q"], Arm(robot)
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
     on_limit = (sides(robot, q.T) != 0).any(axis=1)
     return [
-        (Search(robot, arm, batch["goal_xyz"][:, k], direction[:, k], batch["start_q"][:, k]), q[:, k])
+        (Search(robot, arm, draws["goal_xyz"][:, k], direction[:, k], draws["start_q"][:, k]), q[:, k])
         for k in np.flatnonzero(on_limit)
     ]
 

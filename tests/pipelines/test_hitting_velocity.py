@@ -119,10 +119,10 @@ def test_almost_degenerate_states_are_optimal_by_duality(prepare: Prepare, kerne
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
 def test_hits_of_a_pipeline_are_along_their_direction_and_at_their_speed(prepare: Prepare, name):
     prepared = prepare(name)
-    batch = run_stages(prepared, 1500, seed=53, until="HittingVelocity")
+    draws = run_stages(prepared, 1500, seed=53, until="HittingVelocity")
     arm, limit = Arm(prepared.context.robot), prepared.context.robot.velocity_limit
     for q, dq, angle, speed in zip(
-        batch["goal_q"].T, batch["goal_dq"].T, batch["hit_angle"][0], batch["hit_speed"][0], strict=True
+        draws["goal_q"].T, draws["goal_dq"].T, draws["hit_angle"][0], draws["hit_speed"][0], strict=True
     ):
         x, y, z = arm.velocity(q, dq)
         assert x * np.cos(angle) + y * np.sin(angle) == pytest.approx(speed, abs=1e-12)
@@ -133,17 +133,17 @@ def test_hits_of_a_pipeline_are_along_their_direction_and_at_their_speed(prepare
 
 def test_full_speed_hits_are_at_a_limit(prepare: Prepare):
     prepared = prepare("airhockey-replan")
-    batch = run_stages(prepared, 3000, seed=54, until="HittingVelocity")
-    full = batch["hit_speed"][0] == batch["hit_speed_max"][0]
-    ratio = np.abs(batch["goal_dq"]) / prepared.context.robot.velocity_limit[:, None]
+    draws = run_stages(prepared, 3000, seed=54, until="HittingVelocity")
+    full = draws["hit_speed"][0] == draws["hit_speed_max"][0]
+    ratio = np.abs(draws["goal_dq"]) / prepared.context.robot.velocity_limit[:, None]
     np.testing.assert_allclose(ratio.max(0)[full], 1.0, rtol=1e-12)
 
 
 def stage_on(prepared, q: Array, angle: float) -> Round:
-    batch = Round(1)
-    batch["goal_q"], batch["hit_angle"] = q[:, None].copy(), np.array([[angle]])
-    HittingVelocity(full_speed=1.0).prepare(prepared.context)(batch, np.random.default_rng(0))
-    return batch
+    draws = Round(1)
+    draws["goal_q"], draws["hit_angle"] = q[:, None].copy(), np.array([[angle]])
+    HittingVelocity(full_speed=1.0).prepare(prepared.context)(draws, np.random.default_rng(0))
+    return draws
 
 
 def test_a_stretched_arm_that_cannot_move_along_the_hit_is_rejected(prepare: Prepare):
@@ -151,16 +151,16 @@ def test_a_stretched_arm_that_cannot_move_along_the_hit_is_rejected(prepare: Pre
     prepared = prepare("airhockey-hit")
     for q in (np.zeros(6), np.array([0.0, np.pi / 4, 0.0, 0.0, 0.0, 0.0])):
         for angle in (0.0, np.pi / 2, 1.0):
-            batch = stage_on(prepared, q, angle)
-            assert all(np.isfinite(values).all() for values in batch.columns.values()), (q, angle)
+            draws = stage_on(prepared, q, angle)
+            assert all(np.isfinite(values).all() for values in draws.columns.values()), (q, angle)
 
 
 def test_hits_slower_than_asked_are_rejected(prepare: Prepare):
     prepared = prepare("airhockey-hit")
     robot = prepared.context.robot
     assert len(stage_on(prepared, robot.base, 0.0).alive) == 1
-    batch = Round(1)
-    batch["goal_q"], batch["hit_angle"] = robot.base[:, None].copy(), np.zeros((1, 1))
-    HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(batch, np.random.default_rng(0))
-    assert batch.reasons == ["no hitting velocity"]
-    assert len(batch.alive) == 0
+    draws = Round(1)
+    draws["goal_q"], draws["hit_angle"] = robot.base[:, None].copy(), np.zeros((1, 1))
+    HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(draws, np.random.default_rng(0))
+    assert draws.reasons == ["no hitting velocity"]
+    assert len(draws.alive) == 0

@@ -26,32 +26,32 @@ def solved(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPi
 
 
 def test_the_tip_is_at_its_position_within_a_nanometre(solved):
-    prepared, end, batch = solved
+    prepared, end, draws = solved
     arm = Arm(prepared.context.robot)
-    found = np.array([arm.pose(q).translation.copy() for q in batch[f"{end}_q"].T])
-    assert np.linalg.norm(found - batch[f"{end}_xyz"].T, axis=1).max() < EXACT
+    found = np.array([arm.pose(q).translation.copy() for q in draws[f"{end}_q"].T])
+    assert np.linalg.norm(found - draws[f"{end}_xyz"].T, axis=1).max() < EXACT
 
 
 def test_every_joint_is_within_its_limits(solved):
-    prepared, end, batch = solved
+    prepared, end, draws = solved
     robot = prepared.context.robot
-    assert np.all(robot.position_lower[:, None] <= batch[f"{end}_q"])
-    assert np.all(batch[f"{end}_q"] <= robot.position_upper[:, None])
+    assert np.all(robot.position_lower[:, None] <= draws[f"{end}_q"])
+    assert np.all(draws[f"{end}_q"] <= robot.position_upper[:, None])
 
 
 def test_almost_every_draw_has_a_solution(solved):
-    prepared, _, batch = solved
-    apart = np.sum(batch.fate == 1 + batch.reasons.index("too close together"))
-    yielded = len(batch.alive) / (batch.size - apart)
+    prepared, _, draws = solved
+    apart = np.sum(draws.fate == 1 + draws.reasons.index("too close together"))
+    yielded = len(draws.alive) / (draws.size - apart)
     assert yielded > (0.99 if prepared.context.robot.n == 6 else 0.6)
 
 
 @pytest.mark.parametrize("end", ["start", "goal"])
 def test_the_held_object_stands_upright(prepare, end):
     prepared = prepare("heavy-object")
-    batch = run_stages(prepared, 20_000, seed=32, until="GoalIK")
+    draws = run_stages(prepared, 20_000, seed=32, until="GoalIK")
     arm = Arm(prepared.context.robot)
-    up = np.array([arm.pose(q).rotation[:, 2].copy() for q in batch[f"{end}_q"].T])
+    up = np.array([arm.pose(q).rotation[:, 2].copy() for q in draws[f"{end}_q"].T])
     assert np.abs(up[:, :2]).max() < EXACT
     assert up[:, 2].min() > 0
 
@@ -85,9 +85,9 @@ def test_positions_out_of_reach_are_rejected_and_not_approximated(prepare):
 def test_no_step_of_a_joint_is_longer_than_asked(prepare):
     prepared = prepare("airhockey-replan")
     kernel = prepared.context.kernels.load(ik_step, vertical=False, max_step=0.05)
-    batch = run_stages(prepared, 300, seed=34, until="StartIK")
-    following, _ = kernel(batch["guess_q"], batch["start_xyz"])
-    assert np.abs(following - batch["guess_q"]).max() <= 0.05 + 1e-12
+    draws = run_stages(prepared, 300, seed=34, until="StartIK")
+    following, _ = kernel(draws["guess_q"], draws["start_xyz"])
+    assert np.abs(following - draws["guess_q"]).max() <= 0.05 + 1e-12
 
 
 def test_steps_never_leave_the_joint_limits_even_from_a_corner(prepare):
@@ -112,38 +112,38 @@ def test_a_joint_on_its_limit_leaves_the_way_to_the_others(prepare):
     arguments = {**kernels.arguments, "robot": replace(robot, **limits)}
     kernels = replace(kernels, backend="numpy", identity="narrow third and fifth joint", arguments=arguments)
     kernel = kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=False, max_step=0.4)
-    batch = run_stages(prepared, 400, seed=37, until="StartIK")
-    guess = np.clip(batch["guess_q"], limits["position_lower"][:, None], limits["position_upper"][:, None])
-    q, error = kernel(guess, batch["start_xyz"])
+    draws = run_stages(prepared, 400, seed=37, until="StartIK")
+    guess = np.clip(draws["guess_q"], limits["position_lower"][:, None], limits["position_upper"][:, None])
+    q, error = kernel(guess, draws["start_xyz"])
     solved = error[0] < TOLERANCE
     assert solved.mean() > 0.95
     assert np.sum(np.abs(q[[2, 4]][:, solved]).max(0) == 0.05) > 10
     assert np.abs(q[[2, 4]]).max() <= 0.05
     arm = Arm(robot)
     found = np.array([arm.pose(x).translation.copy() for x in q[:, solved].T])
-    assert np.linalg.norm(found - batch["start_xyz"][:, solved].T, axis=1).max() < EXACT
+    assert np.linalg.norm(found - draws["start_xyz"][:, solved].T, axis=1).max() < EXACT
 
 
 def test_solutions_do_not_depend_on_how_sine_and_cosine_are_rounded(prepare, kernels_of):
     """The backends' differ in the last bit; few joints left by the limits must not blow that up."""
     prepared = prepare("heavy-object")
     options = {"vertical": True, "max_step": 0.8}
-    batch = run_stages(prepared, 6000, seed=38, until="StartIK")
+    draws = run_stages(prepared, 6000, seed=38, until="StartIK")
     one, other = (
         kernels_of(prepared, backend).load(ik_step, Loop(TOLERANCE, MAX_STEPS), **options)
         for backend in (prepared.context.kernels.backend, "numpy")
     )
-    turned = np.nextafter(batch["guess_q"], np.inf)
-    first, second = one(batch["guess_q"], batch["start_xyz"]), other(turned, batch["start_xyz"])
+    turned = np.nextafter(draws["guess_q"], np.inf)
+    first, second = one(draws["guess_q"], draws["start_xyz"]), other(turned, draws["start_xyz"])
     assert np.mean(np.abs(first[0] - second[0]).max(0) > 1e-9) < 1e-3
 
 
 def test_the_goal_is_solved_from_the_start(prepare):
     prepared = prepare("heavy-object")
-    batch = run_stages(prepared, 1500, seed=36, until="GoalIK")
+    draws = run_stages(prepared, 1500, seed=36, until="GoalIK")
     kernel = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8)
-    again, _ = kernel(batch["start_q"], batch["goal_xyz"])
-    np.testing.assert_array_equal(batch["goal_q"], again)
+    again, _ = kernel(draws["start_q"], draws["goal_xyz"])
+    np.testing.assert_array_equal(draws["goal_q"], again)
 
 
 def test_a_guess_of_the_wrong_length_is_a_mistake_in_the_recipe(prepare):

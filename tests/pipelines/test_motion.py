@@ -23,9 +23,9 @@ def moving(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
 
 
 def test_start_velocities_are_horizontal_and_within_their_limits(moving):
-    prepared, batch = moving
+    prepared, draws = moving
     arm, limit = Arm(prepared.context.robot), prepared.context.robot.velocity_limit
-    for q, dq, tip in zip(batch["start_q"].T, batch["start_dq"].T, batch["start_tip_velocity"].T, strict=True):
+    for q, dq, tip in zip(draws["start_q"].T, draws["start_dq"].T, draws["start_tip_velocity"].T, strict=True):
         velocity = arm.velocity(q, dq)
         assert abs(velocity[2]) < EXACT
         np.testing.assert_allclose(velocity, tip, atol=1e-12)
@@ -33,26 +33,26 @@ def test_start_velocities_are_horizontal_and_within_their_limits(moving):
 
 
 def test_start_accelerations_keep_the_tip_on_the_table_and_every_limit(moving):
-    prepared, batch = moving
+    prepared, draws = moving
     robot = prepared.context.robot
     arm = Arm(robot)
-    for q, dq, ddq in zip(batch["start_q"].T, batch["start_dq"].T, batch["start_ddq"].T, strict=True):
+    for q, dq, ddq in zip(draws["start_q"].T, draws["start_dq"].T, draws["start_ddq"].T, strict=True):
         assert abs(arm.acceleration(q, dq, ddq)[2]) < EXACT
         assert np.all(np.abs(ddq) <= robot.acceleration_limit * (1 + 1e-12))
         assert np.all(np.abs(arm.torque(q, dq, ddq)) <= robot.torque_limit * (1 + 1e-12))
 
 
 def test_no_draw_is_lost_to_accelerations(moving):
-    _, batch = moving
+    _, draws = moving
     for reason in ("no acceleration within the limits at the start", "no velocity on the manifold"):
-        assert np.sum(batch.fate == 1 + batch.reasons.index(reason)) == 0
+        assert np.sum(draws.fate == 1 + draws.reasons.index(reason)) == 0
 
 
 def test_the_ends_of_the_interval_of_accelerations_are_on_a_limit_and_a_step_beyond_breaks_it(moving):
-    prepared, batch = moving
+    prepared, draws = moving
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
     kernel = prepared.context.kernels.load(table_acceleration)
-    q, dq = batch["start_q"][:, :300].copy(), batch["start_dq"][:, :300].copy()
+    q, dq = draws["start_q"][:, :300].copy(), draws["start_dq"][:, :300].copy()
     direction = np.random.default_rng(62).uniform(-1, 1, q.shape)
 
     def load(length: float) -> np.ndarray:
@@ -80,19 +80,19 @@ def weak(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
 
 
 def test_small_torque_limits_hold_exactly(weak):
-    prepared, batch = weak
+    prepared, draws = weak
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
-    states = zip(batch["start_q"].T, batch["start_dq"].T, batch["start_ddq"].T, strict=True)
+    states = zip(draws["start_q"].T, draws["start_dq"].T, draws["start_ddq"].T, strict=True)
     ratio = np.array([np.abs(arm.torque(*state)) / robot.torque_limit for state in states]).max(1)
     assert len(ratio) > 500
     assert ratio.max() <= 1 + 1e-12
 
 
 def test_small_torque_limits_are_what_bounds_the_acceleration(weak, moving):
-    prepared, batch = weak
+    prepared, draws = weak
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
     kernel = prepared.context.kernels.load(table_acceleration)
-    q, dq = batch["start_q"], batch["start_dq"]
+    q, dq = draws["start_q"], draws["start_dq"]
     direction = np.random.default_rng(63).uniform(-1, 1, q.shape)
     ddq, room = kernel(q, dq, direction, np.ones((1, q.shape[1])))
     fine = room[0] >= 0
@@ -108,11 +108,11 @@ def test_small_torque_limits_are_what_bounds_the_acceleration(weak, moving):
 def test_draws_that_cannot_be_accelerated_within_tiny_torque_limits_are_rejected_and_counted(prepare: Prepare):
     """Holding still takes more than these limits: no acceleration is left."""
     prepared = prepare(with_torque_scale(prepare("airhockey-replan").pipeline, 0.02), "numpy")
-    batch = run_stages(prepared, 500, seed=61)
-    reason = batch.reasons.index("no acceleration within the limits at the start")
-    assert np.sum(batch.fate == 1 + reason) > 300
+    draws = run_stages(prepared, 500, seed=61)
+    reason = draws.reasons.index("no acceleration within the limits at the start")
+    assert np.sum(draws.fate == 1 + reason) > 300
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
-    for state in zip(batch["start_q"].T, batch["start_dq"].T, batch["start_ddq"].T, strict=True):
+    for state in zip(draws["start_q"].T, draws["start_dq"].T, draws["start_ddq"].T, strict=True):
         assert np.all(np.abs(arm.torque(*state)) <= robot.torque_limit * (1 + 1e-12))
 
 
@@ -148,6 +148,6 @@ def test_problems_without_a_table_have_no_table_velocity(prepare: Prepare, stage
 
 def test_all_starts_may_be_at_rest(prepare: Prepare):
     prepared = prepare("airhockey-replan")
-    batch = run_stages(prepared, 100, until="StartIK")
-    TableVelocity(at_rest=1.0).prepare(prepared.context)(batch, random_generator(1, "train", 0))
-    np.testing.assert_array_equal(batch["start_dq"], 0.0)
+    draws = run_stages(prepared, 100, until="StartIK")
+    TableVelocity(at_rest=1.0).prepare(prepared.context)(draws, random_generator(1, "train", 0))
+    np.testing.assert_array_equal(draws["start_dq"], 0.0)

@@ -11,8 +11,8 @@ from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
+from cnpgen.store.fates import Fates, merge_fates
 from cnpgen.store.field import Field
-from cnpgen.store.outcome import Fates, merge_fates
 from tests.conftest import SHIPPED, Prepare, needs_compiler
 
 CLOSE = 1e-9  # SI: what backends may differ by
@@ -35,7 +35,7 @@ def assert_same_columns(found: dict[str, np.ndarray], expected: dict[str, np.nda
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def assert_same_outcome(found: Fates, expected: Fates) -> None:
+def assert_same_fates(found: Fates, expected: Fates) -> None:
     assert (found.tried, found.accepted) == (expected.tried, expected.accepted)
     assert dict(found.rejections) == dict(expected.rejections)
     for name, density in expected.densities.items():
@@ -46,7 +46,7 @@ def assert_same_outcome(found: Fates, expected: Fates) -> None:
 def test_a_block_made_twice_is_the_same_to_the_bit(prepared, whole):
     again = prepared.block(SEED, "train", 0)
     assert_same_columns(again.columns, whole.columns)
-    assert_same_outcome(again.outcome, whole.outcome)
+    assert_same_fates(again.fates, whole.fates)
 
 
 @pytest.mark.parametrize("other", [(SEED + 1, "train", 0), (SEED, "validation", 0), (SEED, "train", 1)])
@@ -64,14 +64,14 @@ def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple
         for first, stop in zip([0, *cuts], [*cuts, BLOCK_ROWS], strict=True)
     ]
     columns = {name: np.concatenate([part.columns[name] for part in made], axis=1) for name in made[0].columns}
-    return columns, merge_fates([part.outcome for part in made])
+    return columns, merge_fates([part.fates for part in made])
 
 
 @pytest.mark.parametrize("cuts", [[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]])
-def test_pieces_of_a_block_are_its_rows_and_their_outcomes_add_up(prepared, whole, cuts):
-    columns, outcome = pieces(prepared, cuts)
+def test_pieces_of_a_block_are_its_rows_and_their_fates_add_up(prepared, whole, cuts):
+    columns, fates = pieces(prepared, cuts)
     assert_same_columns(columns, whole.columns)
-    assert_same_outcome(outcome, whole.outcome)
+    assert_same_fates(fates, whole.fates)
 
 
 def test_pieces_that_are_asked_for_together_are_those_asked_for_one_by_one(prepared, whole):
@@ -81,12 +81,12 @@ def test_pieces_that_are_asked_for_together_are_those_asked_for_one_by_one(prepa
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PreparedPipeline, "_round", lambda *x: (drawn.append(x[2]), run(*x))[1])
         together = list(prepared.pieces(SEED, "train", 0, ranges))
-    assert sum(drawn) < 1.3 * whole.outcome.tried + 300
+    assert sum(drawn) < 1.3 * whole.fates.tried + 300
     assert len(together) == len(ranges)
     for (first, stop), piece in zip(ranges, together, strict=True):
         alone = prepared.block(SEED, "train", 0, first=first, stop=stop)
         assert_same_columns(piece.columns, alone.columns)
-        assert_same_outcome(piece.outcome, alone.outcome)
+        assert_same_fates(piece.fates, alone.fates)
 
 
 def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[int]]:
@@ -95,10 +95,10 @@ def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[
     run = PreparedPipeline._round
 
     def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
-        batch = run(self, random, size)
-        sizes.append(len(batch.alive))
-        tails.append(batch.size - 1 - int(batch.alive[-1]))
-        return batch
+        draws = run(self, random, size)
+        sizes.append(len(draws.alive))
+        tails.append(draws.size - 1 - int(draws.alive[-1]))
+        return draws
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PreparedPipeline, "_round", noted)
@@ -114,9 +114,9 @@ def test_a_piece_that_begins_with_a_round_counts_the_draws_rejected_at_the_end_o
         if tails[0] == 0 or tested == 3:
             continue
         tested += 1
-        whole, (columns, outcome) = prepared.block(SEED, "train", index), pieces(prepared, [ends[0]], index)
+        whole, (columns, fates) = prepared.block(SEED, "train", index), pieces(prepared, [ends[0]], index)
         assert_same_columns(columns, whole.columns)
-        assert_same_outcome(outcome, whole.outcome)
+        assert_same_fates(fates, whole.fates)
     assert tested == 3
 
 
@@ -124,25 +124,25 @@ def test_a_shorter_block_is_the_beginning_of_a_longer_one(prepared, whole):
     for stop in (1, 7, 1500, 2900):
         short = prepared.block(SEED, "train", 0, stop=stop)
         assert_same_columns(short.columns, {name: values[:, :stop] for name, values in whole.columns.items()})
-        assert short.outcome.accepted == stop
-        assert short.outcome.tried == whole.columns["attempts"][0, :stop].sum()
+        assert short.fates.accepted == stop
+        assert short.fates.tried == whole.columns["attempts"][0, :stop].sum()
 
 
 # --- counts -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_draw_is_accepted_or_counted_under_one_reason(prepared, whole):
-    outcome = whole.outcome
-    assert outcome.accepted == BLOCK_ROWS == whole.columns["attempts"].shape[1]
-    assert outcome.tried == outcome.accepted + sum(outcome.rejections.values())
-    assert sum(outcome.rejections.values()) > 100
+    fates = whole.fates
+    assert fates.accepted == BLOCK_ROWS == whole.columns["attempts"].shape[1]
+    assert fates.tried == fates.accepted + sum(fates.rejections.values())
+    assert sum(fates.rejections.values()) > 100
 
 
 def test_attempts_sum_to_the_draws_tried(prepared, whole):
     attempts = whole.columns["attempts"]
     assert attempts.dtype == np.int64
     assert attempts.min() == 1
-    assert attempts.sum() == whole.outcome.tried
+    assert attempts.sum() == whole.fates.tried
 
 
 def test_attempts_count_the_draws_from_one_row_to_the_next_across_rounds(prepared, whole):
@@ -151,9 +151,9 @@ def test_attempts_count_the_draws_from_one_row_to_the_next_across_rounds(prepare
     run = PreparedPipeline._round
 
     def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
-        batch = run(self, random, size)
-        fates.extend(batch.fate.tolist())
-        return batch
+        draws = run(self, random, size)
+        fates.extend(draws.fate.tolist())
+        return draws
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PreparedPipeline, "_round", noted)
@@ -163,7 +163,7 @@ def test_attempts_count_the_draws_from_one_row_to_the_next_across_rounds(prepare
 
 
 def test_every_reason_that_a_stage_or_a_constraint_has_is_listed_even_if_nothing_was_rejected_for_it(prepared, whole):
-    reasons = list(whole.outcome.rejections)
+    reasons = list(whole.fates.rejections)
     constraints = [constraint.reason for constraint in prepared.context.problem.constraint]
     assert reasons[0] == "too close together"
     assert [reason for reason in reasons if reason in constraints] == constraints
@@ -172,9 +172,9 @@ def test_every_reason_that_a_stage_or_a_constraint_has_is_listed_even_if_nothing
 
 
 def test_density_maps_count_every_draw_and_every_row(prepared, whole):
-    assert whole.outcome.densities.keys() == {"start_xyz", "goal_xyz"}
-    for name, density in whole.outcome.densities.items():
-        assert density.drawn.sum() == whole.outcome.tried
+    assert whole.fates.densities.keys() == {"start_xyz", "goal_xyz"}
+    for name, density in whole.fates.densities.items():
+        assert density.drawn.sum() == whole.fates.tried
         assert density.accepted.sum() == BLOCK_ROWS
         x, y, _ = whole.columns[name]
         expected, _, _ = np.histogram2d(x, y, density.accepted.shape, [density.x, density.y])
@@ -185,10 +185,10 @@ def test_density_maps_count_every_draw_and_every_row(prepared, whole):
 def test_nothing_that_the_stages_pass_on_is_rejected_at_the_last_gate(prepare: Prepare, name):
     """The stages are exact: the gate is there for what nobody has thought of."""
     prepared = prepare(name)
-    outcome = merge_fates([prepared.block(SEED, "test", index).outcome for index in range(8)])
+    fates = merge_fates([prepared.block(SEED, "test", index).fates for index in range(8)])
     gate = [constraint.reason for constraint in prepared.context.problem.constraint]
     gate += ["tip not at its position", "hit not along its direction"]
-    assert {reason: count for reason, count in outcome.rejections.items() if reason in gate and count} == {}
+    assert {reason: count for reason, count in fates.rejections.items() if reason in gate and count} == {}
 
 
 def test_a_pipeline_that_accepts_nothing_is_given_up_with_its_reasons(prepare: Prepare):
@@ -220,7 +220,7 @@ def test_backends_agree_on_the_same_draws(prepare: Prepare, name, backend, size)
     assert len(flipped) <= 2
     assert set(one.reasons) == set(other.reasons)
     common = np.intersect1d(one.alive, other.alive)
-    rows = [np.searchsorted(batch.alive, common) for batch in (one, other)]
+    rows = [np.searchsorted(draws.alive, common) for draws in (one, other)]
     assert one.columns.keys() == other.columns.keys()
     off = np.zeros(len(common), bool)
     for column in one.columns:

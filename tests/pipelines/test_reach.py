@@ -16,11 +16,11 @@ from tests.conftest import Arm, Prepare, run_stages, without_stages
 def batch_at(
     start: tuple[float, ...], velocity: tuple[float, ...], goal: tuple[float, ...], hit: tuple[float, ...]
 ) -> Round:
-    batch = Round(1)
-    batch["start_xyz"], batch["goal_xyz"] = (np.array([[*xy, 0.16]]).T for xy in (start, goal))
-    batch["start_tip_velocity"] = np.array([[*velocity, 0.0]]).T
-    batch["hit_angle"], batch["hit_speed"] = (np.array([[value]]) for value in hit)
-    return batch
+    draws = Round(1)
+    draws["start_xyz"], draws["goal_xyz"] = (np.array([[*xy, 0.16]]).T for xy in (start, goal))
+    draws["start_tip_velocity"] = np.array([[*velocity, 0.0]]).T
+    draws["hit_angle"], draws["hit_speed"] = (np.array([[value]]) for value in hit)
+    return draws
 
 
 CASES = {
@@ -45,11 +45,11 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_starts_and_hits_that_leave_the_table_are_rejected_and_no_others(prepare: Prepare, case):
     *state, reason = CASES[case]
-    batch = batch_at(*state)
+    draws = batch_at(*state)
     BallisticReach(start_time=0.02, goal_time=0.05).prepare(prepare("airhockey-hit").context)(
-        batch, random_generator(0, "train", 0)
+        draws, random_generator(0, "train", 0)
     )
-    fates = [reason for k, reason in enumerate(batch.reasons) if 1 + k in batch.fate]
+    fates = [reason for k, reason in enumerate(draws.reasons) if 1 + k in draws.fate]
     assert fates == ([reason] if reason else [])
 
 
@@ -57,11 +57,11 @@ def test_starts_and_hits_that_leave_the_table_are_rejected_and_no_others(prepare
 def test_no_accepted_row_leaves_the_table_by_pinocchio_s_velocities(prepare: Prepare, name, start_time):
     prepared = prepare(name)
     table = prepared.context.constraint(Table)
-    batch = run_stages(prepared, 3000, seed=71)
+    draws = run_stages(prepared, 3000, seed=71)
     arm = Arm(prepared.context.robot)
     ends = [("start", start_time), ("goal", 0.05), ("goal", -0.05)]
     for end, time in ends:
-        for position, q, dq in zip(batch[f"{end}_xyz"].T, batch[f"{end}_q"].T, batch[f"{end}_dq"].T, strict=True):
+        for position, q, dq in zip(draws[f"{end}_xyz"].T, draws[f"{end}_q"].T, draws[f"{end}_dq"].T, strict=True):
             x, y, _ = position + time * arm.velocity(q, dq)
             assert table.x.low - 1e-9 <= x <= table.x.high + 1e-9
             assert table.y.low - 1e-9 <= y <= table.y.high + 1e-9
@@ -71,28 +71,28 @@ def test_the_rule_rejects_exactly_the_draws_that_numpy_says_leave(prepare: Prepa
     pipeline = without_stages(prepare("airhockey-replan").pipeline, "BallisticReach")
     prepared = prepare(pipeline)
     table = prepared.context.constraint(Table)
-    batch = run_stages(prepared, 3000, seed=72)
-    velocity = batch["hit_speed"] * np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
-    inside = np.ones(len(batch.alive), bool)
+    draws = run_stages(prepared, 3000, seed=72)
+    velocity = draws["hit_speed"] * np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
+    inside = np.ones(len(draws.alive), bool)
     for points in (
-        batch["start_xyz"][:2] + 0.02 * batch["start_tip_velocity"][:2],
-        batch["goal_xyz"][:2] + 0.05 * velocity,
-        batch["goal_xyz"][:2] - 0.05 * velocity,
+        draws["start_xyz"][:2] + 0.02 * draws["start_tip_velocity"][:2],
+        draws["goal_xyz"][:2] + 0.05 * velocity,
+        draws["goal_xyz"][:2] - 0.05 * velocity,
     ):
         low, high = np.array([[table.x.low, table.x.high], [table.y.low, table.y.high]]).T[:, :, None]
         inside &= np.all((low <= points) & (points <= high), axis=0)
-    expected = batch.alive[inside]
-    BallisticReach(start_time=0.02, goal_time=0.05).prepare(prepared.context)(batch, random_generator(0, "train", 0))
-    np.testing.assert_array_equal(batch.alive, expected)
+    expected = draws.alive[inside]
+    BallisticReach(start_time=0.02, goal_time=0.05).prepare(prepared.context)(draws, random_generator(0, "train", 0))
+    np.testing.assert_array_equal(draws.alive, expected)
     assert 0.05 < 1 - inside.mean() < 0.3
 
 
 def test_without_times_nothing_is_needed_and_nothing_rejected(prepare: Prepare):
     stage = BallisticReach()
     assert stage.needs == ()
-    batch = Round(5)
-    stage.prepare(prepare("airhockey-hit").context)(batch, random_generator(0, "train", 0))
-    assert batch.reasons == []
+    draws = Round(5)
+    stage.prepare(prepare("airhockey-hit").context)(draws, random_generator(0, "train", 0))
+    assert draws.reasons == []
 
 
 def test_a_stage_that_needs_what_no_stage_wrote_is_a_mistake_in_the_recipe(prepare: Prepare):

@@ -34,11 +34,11 @@ def test_the_payload_is_part_of_the_torque(prepare: Prepare):
 
 def test_torque_ratios_of_accepted_rows_are_stored_and_at_most_one(prepare: Prepare):
     prepared = prepare("heavy-object")
-    batch = run_stages(prepared, 1500, seed=102)
+    draws = run_stages(prepared, 1500, seed=102)
     robot, arm, zero = prepared.context.robot, Arm(prepared.context.robot), np.zeros(7)
     for end in ("start", "goal"):
-        expected = [np.max(np.abs(arm.torque(q, zero, zero)) / robot.torque_limit) for q in batch[f"{end}_q"].T]
-        np.testing.assert_allclose(batch[f"{end}_torque_ratio"][0], expected, rtol=1e-12)
+        expected = [np.max(np.abs(arm.torque(q, zero, zero)) / robot.torque_limit) for q in draws[f"{end}_q"].T]
+        np.testing.assert_allclose(draws[f"{end}_torque_ratio"][0], expected, rtol=1e-12)
         assert 0.3 < max(expected) <= 1
 
 
@@ -46,14 +46,14 @@ def test_configurations_that_need_too_much_torque_are_rejected_and_counted(prepa
     pipeline = prepare("heavy-object").pipeline
     problem = replace(pipeline.problem, limits=replace(pipeline.problem.limits, torque_scale=0.35))
     prepared = prepare(replace(pipeline, problem=problem), "numpy")
-    batch = run_stages(prepared, 1500, seed=102)
-    counts = np.bincount(batch.fate, minlength=1 + len(batch.reasons))[1:]
-    fates = dict(zip(batch.reasons, counts.tolist(), strict=True))
+    draws = run_stages(prepared, 1500, seed=102)
+    counts = np.bincount(draws.fate, minlength=1 + len(draws.reasons))[1:]
+    fates = dict(zip(draws.reasons, counts.tolist(), strict=True))
     assert fates["joint torque limit at the start"] > 50
     assert fates["joint torque limit at the goal"] > 10
     robot, arm, zero = prepared.context.robot, Arm(prepared.context.robot), np.zeros(7)
     for end in ("start", "goal"):
-        for q in batch[f"{end}_q"].T:
+        for q in draws[f"{end}_q"].T:
             assert np.all(np.abs(arm.torque(q, zero, zero)) <= robot.torque_limit * (1 + 1e-12))
 
 

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import cnpgen
 from cnpgen.errors import UsageError
 from cnpgen.planner.omega import Omega
+from cnpgen.plans.format import BOUNDARY
+from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import needs_compiler
 from tests.examples.plans_of_networks import at_ends, boundary, outputs
 
@@ -119,3 +122,37 @@ def test_what_cannot_be_meant_is_refused(omegas: dict[str, Omega]) -> None:
         Omega("airhockey", landing_steps=1.5)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="path_scale must be a finite number, got None"):
         Omega("airhockey", path_scale=None)  # type: ignore[arg-type]
+
+
+def test_plans_of_a_shuffled_batch_meet_and_name_the_rows_of_the_dataset(tiny: Any, omegas: Any) -> None:
+    dataset = cnpgen.load_dataset(tiny("airhockey-replan"))
+    rows = dataset.arrays("train", fields=[*BOUNDARY, "sample_id"])
+    omega = omegas["airhockey"]
+    batch = next(iter(dataset.batches(8, fields=[*BOUNDARY, "hit_speed", "sample_id"], dtype="float64")))
+    boundary = Boundary.from_batch(batch, dataset.normalization)
+    tasks = omega.tasks(boundary)
+    phi, log_rate = np.zeros((8, omega.path_outputs)), np.zeros((8, omega.rate_outputs))
+    plans = omega.plans(tasks, phi, log_rate, sample_id=batch["sample_id"])
+    assert plans.sample_id.tolist() == batch["sample_id"].tolist() != list(range(8))
+    for plan in plans:
+        row = int(np.flatnonzero(rows["sample_id"] == plan.sample_id[0])[0])
+        for name in BOUNDARY:
+            np.testing.assert_allclose(getattr(plan.boundary, name)[0], rows[name][row], atol=1e-12)
+
+
+def test_boundary_conditions_are_taken_out_of_rows_in_their_units(tiny: Any) -> None:
+    rows = cnpgen.load_dataset(tiny("airhockey-replan")).arrays("train")
+    boundary = Boundary.from_batch(rows, None)
+    assert boundary.goal_ddq is None
+    np.testing.assert_array_equal(boundary.start_ddq, rows["start_ddq"])
+    assert Boundary.from_batch({**rows, "goal_ddq": rows["start_ddq"]}, None).fixed_at_goal == 3
+    with pytest.raises(
+        UsageError, match="the batch lacks start_ddq, goal_dq: it has the fields start_q, start_dq, goal_q"
+    ):
+        Boundary.from_batch({name: rows[name] for name in ("start_q", "start_dq", "goal_q")}, None)
+
+
+def test_joint_positions_in_degrees_are_said_to_be_suspicious(omegas: Any) -> None:
+    given = boundary("airhockey", 4)
+    with pytest.warns(UserWarning, match="goal_q of plan 0: joint_. = .* rad is far outside of its limits"):
+        omegas["airhockey"].tasks(replace(given, goal_q=np.degrees(given.goal_q)))

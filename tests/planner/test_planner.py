@@ -10,6 +10,8 @@ from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.status import PlanStatus
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.record import record_problem
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
@@ -26,7 +28,9 @@ def planner(rows) -> Planner:
 
 
 def planned(planner: Planner, rows: Boundary):
-    return planner.plan(rows.start_q, rows.start_dq, rows.start_ddq, goal_q=rows.goal_q, goal_dq=rows.goal_dq)
+    return planner.plan(
+        rows.start_q, rows.goal_q, start_dq=rows.start_dq, start_ddq=rows.start_ddq, goal_dq=rows.goal_dq
+    )
 
 
 def test_plans_meet_their_boundary_conditions_by_the_independent_verdict(planner, rows):
@@ -41,16 +45,14 @@ def test_one_plan_is_the_same_alone_and_among_others(planner, rows):
     assert len(many) == 40
     assert (many.status == PlanStatus.UNKNOWN).all()
     for i in (0, 7, 39):
-        one = planner.plan(
-            rows.start_q[i], rows.start_dq[i], rows.start_ddq[i], goal_q=rows.goal_q[i], goal_dq=rows.goal_dq[i]
-        )
+        one = planned(planner, rows[i])
         assert len(one) == 1
         np.testing.assert_allclose(one.path_control_points[0], many.path_control_points[i], atol=1e-5)
         np.testing.assert_allclose(one.rate_control_points[0], many.rate_control_points[i], rtol=1e-5)
 
 
 def test_what_is_left_out_is_at_rest(planner, rows):
-    given = planner.plan(rows.start_q[0], goal_q=rows.goal_q[0])
+    given = planner.plan(rows.start_q[0], rows.goal_q[0])
     np.testing.assert_array_equal(given.boundary.start_dq, 0)
     np.testing.assert_array_equal(given.boundary.goal_dq, 0)
     q, dq, ddq = states_at(given, 0.0)
@@ -81,7 +83,7 @@ def test_replanning_goes_on_without_a_jump_in_position_velocity_or_acceleration(
 
 def test_a_feint_and_then_a_strike_is_one_continuous_motion(planner, rows):
     """Sampled across both switches, velocities and accelerations are no further apart than a step of time explains."""
-    feint = planner.plan(rows.start_q[0], goal_q=rows.goal_q[1])
+    feint = planner.plan(rows.start_q[0], rows.goal_q[1])
     second = planner.replan(feint, 0.5 * feint.duration, goal_q=rows.goal_q[2])
     strike = planner.replan(second, 0.5 * second.duration, goal_q=rows.goal_q[3], goal_dq=rows.goal_dq[3])
     h = 1e-6
@@ -93,11 +95,13 @@ def test_a_feint_and_then_a_strike_is_one_continuous_motion(planner, rows):
         np.testing.assert_allclose((dq1 - dq0) / (2 * h), (ddq0 + ddq1) / 2, atol=1e-2)
 
 
-def test_the_order_of_the_paper_is_that_of_positional_arguments(planner, rows):
-    ends = (rows.start_q, rows.start_dq, rows.start_ddq, rows.goal_q, rows.goal_dq)
-    np.testing.assert_array_equal(planner.plan(*ends).path_control_points, planned(planner, rows).path_control_points)
-    with pytest.raises(UsageError, match="goal_q is missing"):
+def test_start_and_goal_are_asked_for_first_and_velocities_by_keyword(planner, rows):
+    plans = planner.plan(rows.start_q, rows.goal_q)
+    np.testing.assert_array_equal(plans.boundary.goal_q, rows.goal_q)
+    with pytest.raises(TypeError, match="goal_q"):
         planner.plan(rows.start_q)
+    with pytest.raises(TypeError, match="positional"):
+        planner.plan(rows.start_q, rows.goal_q, rows.start_dq)
 
 
 def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(tiny):
@@ -110,11 +114,11 @@ def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(
     np.testing.assert_array_equal(again.boundary.start_ddq, 0.0)
     np.testing.assert_allclose(again.path_control_points, plans.path_control_points, atol=1e-5)
     limit = planner.robot.velocity_limit
-    planner.plan(rest.start_q, 0.9e-9 * limit, goal_q=rest.goal_q)
+    planner.plan(rest.start_q, rest.goal_q, start_dq=0.9e-9 * limit)
     with pytest.raises(UsageError, match="start_dq was zero"):
-        planner.plan(rest.start_q, 1.1e-9 * limit, goal_q=rest.goal_q)
+        planner.plan(rest.start_q, rest.goal_q, start_dq=1.1e-9 * limit)
     q, dq, _ = states_at(plans, plans.duration)
-    np.testing.assert_allclose(planner.plan(q, dq, goal_q=rest.start_q).boundary.start_dq, 0.0, atol=0)
+    np.testing.assert_allclose(planner.plan(q, rest.start_q, start_dq=dq).boundary.start_dq, 0.0, atol=0)
 
 
 def test_a_planner_goes_to_other_processes_without_its_kernels(planner, rows):
@@ -130,11 +134,11 @@ def test_planners_models_and_plans_say_in_a_line_what_they_are(planner, rows):
     plans = planned(planner, rows)
     assert repr(plans) == "<40 plans of 'airhockey': 40 unknown>"
     status = np.array([1, 1, 2], np.uint8)
-    assert repr(replace(plans.select(slice(0, 3)), status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
-    assert repr(plans.select(slice(0, 0))) == "<0 plans of 'airhockey'>"
+    assert repr(replace(plans[:3], status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
+    assert repr(plans[:0]) == "<0 plans of 'airhockey'>"
 
 
-@pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
+@pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit", record_problem(load_problem("airhockey"))])
 def test_what_is_no_model_is_refused_by_its_value(wrong):
     with pytest.raises(UsageError, match=f"a model is a name or a path, got {wrong!r}"):
         Planner(wrong)
@@ -195,3 +199,10 @@ def test_plans_are_the_same_on_every_backend(planner, rows, backend):
     np.testing.assert_allclose(
         planned(other, rows).path_control_points, planned(planner, rows).path_control_points, atol=1e-5
     )
+
+
+def test_joint_positions_in_degrees_are_said_to_be_suspicious(planner, rows):
+    with pytest.warns(
+        UserWarning, match="start_q of plan 0: joint_2 = 40 rad is far outside of its limits, .* degrees"
+    ):
+        planner.plan(np.array([0, 40.0, 0, -30, 0, 110]), rows.goal_q[0])

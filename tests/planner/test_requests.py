@@ -88,7 +88,7 @@ def test_prescribed_goal_accelerations_are_not_dropped(tmp_path, model):
 
 
 def test_other_rows_are_not_asked_of_a_file_that_says_nothing_of_its_rows(tmp_path, model):
-    with pytest.raises(UsageError, match="--other-rows is for rows of a dataset"):
+    with pytest.raises(UsageError, match="other=True is for rows of a dataset"):
         read_file(write(tmp_path / "a.h5"), model, other=True)
 
 

@@ -45,6 +45,26 @@ def test_garbage_gets_an_honest_verdict_and_a_status_and_changes_nothing_beside_
     assert first == last
 
 
+@pytest.mark.parametrize("end", ["start", "goal"])
+def test_plans_in_memory_and_in_a_file_get_one_verdict_where_a_tip_position_was_changed(
+    tmp_path: Path, end: str
+) -> None:
+    """A start_xyz too high by 5 cm would raise the pedestal below it into the object: the joints count, both ways."""
+    right = plans_of(load("transport"), load("transport"))
+    moved = right.columns[f"{end}_xyz"] + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.05]])
+    changed = replace(right, columns={**right.columns, f"{end}_xyz": moved})
+    said = f"{end}_xyz of 1 plan is not where {end}_q puts the tip .the first is plan 1, 0.05 m off.: what the joints"
+    with pytest.warns(RuntimeWarning, match=f"^{said}"):
+        in_memory = evaluate_plans(changed)
+    save_plans(tmp_path / "changed.h5", changed)
+    with pytest.warns(RuntimeWarning, match=f"changed.h5: {said}"):
+        in_file = evaluate_plans(load_plans(tmp_path / "changed.h5"))
+    assert told(in_memory.verdicts) == told(in_file.verdicts) == told(evaluate_plans(right).verdicts)
+    assert in_memory.valid.all()
+    np.testing.assert_allclose(in_memory.plans.columns[f"{end}_xyz"], right.columns[f"{end}_xyz"], atol=1e-12)
+    assert evaluate_plans(right).plans is right
+
+
 def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cnpgen.plans.evaluate, "PART", 3)
     plans = plans_of(*(plan for plan, _ in garbage().values()))
@@ -70,7 +90,7 @@ def test_tolerances_of_another_problem_file_count(tmp_path: Path) -> None:
 
 
 def test_no_plans_have_no_verdicts() -> None:
-    found = evaluate_plans(plans_of(load("hit")).select(slice(0)))
+    found = evaluate_plans(plans_of(load("hit"))[:0])
     assert found.verdicts == ()
     assert found.valid.shape == found.status.shape == (0,)
     assert found.summary()["valid_ratio"] is None

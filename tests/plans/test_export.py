@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.plans import Plans
 from cnpgen.plans.export import FORMS, Exported, export_plans
 from cnpgen.plans.formats import sample_plan
+from cnpgen.problems.load import load_problem
 from cnpgen.trajectory.motion import Motion
 from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
 
@@ -78,7 +80,7 @@ def test_every_form_holds_the_plans_as_they_are(tmp_path: Path, form: Any, rate:
         assert np.all(np.diff(t) > 0)
         assert np.allclose(t[:-1], np.arange(len(t) - 1) / rate, atol=1e-9)
         assert 0.009 / rate < t[-1] - t[-2] < 1.0101 / rate
-        motion = plans.select(np.array([index])).motion
+        motion = plans[np.array([index])].motion
         states = motion.at(motion.phase_at(t[None]))
         for name in values.keys() - {"t"}:
             expected = getattr(states, name)[0]
@@ -94,7 +96,33 @@ def test_npz_says_which_plans_and_samples_there_are(tmp_path: Path) -> None:
     with np.load(exported.files[0]) as data:
         assert data["plan"].tolist() == [0, 9]
         assert data["sample_id"].tolist() == [0, 99]
-        assert len(data.files) == 3 + 2 * 5
+        assert len(data.files) == 5 + 2 * 5
+
+
+@pytest.mark.parametrize(
+    ("name", "held"),
+    [("airhockey", {"joint_7": 0.0, "striker_joint_1": 0.0, "striker_joint_2": 0.0}), ("heavy-object", {})],
+)
+def test_exports_say_where_the_joints_stay_that_are_not_planned(
+    tmp_path: Path, name: str, held: dict[str, float]
+) -> None:
+    plans = draw_plans(problem=load_problem(name), n=2)
+    model = pin.buildModelFromXML(plans.problem.urdf)
+    planned = set(plans.problem.joint_names)
+    assert {each for each in [*model.names][1:] if each not in planned} == set(held)
+    with np.load(export_plans(plans, tmp_path / "a.npz", to="npz", rate=50).files[0]) as data:
+        names, positions = data["held_joint_names"].tolist(), data["held_joint_positions"].tolist()
+        assert dict(zip(names, positions, strict=True)) == held
+    for form in ("csv", "joint-trajectory"):
+        exported = export_plans(plans, tmp_path / form, to=form, rate=50)  # type: ignore[arg-type]
+        if not held:
+            assert exported.held_joints is None
+            assert sorted((tmp_path / form).iterdir()) == sorted(exported.files)
+            continue
+        assert exported.held_joints == tmp_path / form / "held_joints.yaml"
+        lines = exported.held_joints.read_text().splitlines()
+        assert json.loads("{" + ",".join(lines) + "}") == held
+    assert export_plans(plans, tmp_path / "b.npz", to="npz", rate=50).held_joints is None
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -192,11 +220,11 @@ def test_plans_of_a_million_samples_or_less_than_a_nanosecond_are_refused(tmp_pa
 
 @pytest.mark.parametrize("form", FORMS)
 def test_if_no_plan_can_be_exported_nothing_is_written(tmp_path: Path, form: Any) -> None:
-    bad = garbage().select(np.arange(1, 9))
+    bad = garbage()[np.arange(1, 9)]
     with pytest.raises(DatasetError, match=r"none of the 8 plans can be exported: plan 0 \(sample 1\): a boundary"):
         export_plans(bad, tmp_path / "out", to=form)
     with pytest.raises(DatasetError, match=r"none of the 0 plans can be exported$"):
-        export_plans(bad.select(np.zeros(8, bool)), tmp_path / "out", to=form)
+        export_plans(bad[np.zeros(8, bool)], tmp_path / "out", to=form)
     assert not (tmp_path / "out").exists()
 
 

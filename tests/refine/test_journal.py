@@ -85,7 +85,9 @@ def test_a_journal_that_was_cut_in_its_first_line_is_begun_anew(tmp_path: Path, 
 def test_the_journal_of_another_run_is_kept_unless_it_may_be_thrown_away(tmp_path: Path) -> None:
     path = tmp_path / "part"
     written(path)
-    with pytest.raises(UsageError, match=r"part holds 6 finished plans of another run \(run one, now two\): --force"):
+    with pytest.raises(
+        UsageError, match=r"part holds 6 finished plans of another run \(run one, now two\): discard=True"
+    ):
         open_journal(path, '{"run": "two"}')
     assert len(kept(path)) == 6
     open_journal(path, '{"run": "two"}', discard=True).close()

@@ -16,7 +16,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.proof import table_proof
-from cnpgen.refine.proof.proof import Explanation, Kind, explain_failure, explain_plans
+from cnpgen.refine.proof.proof import Explanation, Feasibility, explain_failure, explain_plans
 from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, joint_limits, moments
 from cnpgen.refine.proof.table_proof import table_bounds
 from cnpgen.refine.proof.tip_bound import Arm, bound_projection
@@ -36,7 +36,7 @@ def explain(plan: Plan, **changes: np.ndarray) -> Explanation:
 @cache
 def solved(name: str, count: int) -> Plans:
     plans = refine_plans(draw_problems(name, count, seed=8), workers=1)
-    return plans.plans.select(np.flatnonzero(plans.valid))
+    return plans.plans[np.flatnonzero(plans.valid)]
 
 
 def tip_at(name: str, q: np.ndarray) -> np.ndarray:
@@ -63,7 +63,7 @@ def table_of(plan: Plan):
 @pytest.mark.parametrize("label", LABELS)
 def test_nothing_is_proven_about_a_problem_with_a_valid_plan(label: str) -> None:
     assert load(label).judged().valid
-    assert explain(load(label)).kind is Kind.UNKNOWN
+    assert explain(load(label)).kind is Feasibility.UNKNOWN
 
 
 @pytest.mark.parametrize(("name", "count"), [("airhockey-replan", 3), ("airhockey-hit", 3), ("heavy-object", 1)])
@@ -71,7 +71,7 @@ def test_no_solved_problem_is_called_infeasible(name: str, count: int) -> None:
     plans = solved(name, count)
     found = explain_plans(plans, range(len(plans)))
     assert len(found) > count / 2
-    assert Kind.INFEASIBLE not in {each.kind for each in found.values()}
+    assert Feasibility.INFEASIBLE not in {each.kind for each in found.values()}
 
 
 def mirrored(plan: Plan) -> Plan:
@@ -109,7 +109,7 @@ def test_proofs_about_solved_problems_at_the_edge_are_tried_and_fail(
         monkeypatch.setattr(table_proof, "VERGE", 1.0)
         monkeypatch.setattr(table_proof, "CARRIED", -1.0)
     assert refine(plan).valid
-    assert explain_case(plan).kind is Kind.VERGE
+    assert explain_case(plan).kind is Feasibility.VERGE
     assert calls
 
 
@@ -179,24 +179,24 @@ def test_derivatives_of_the_tip_are_those_of_finite_differences_and_within_the_r
 
 def test_a_tip_that_cannot_stop_before_the_edge_is_proven_to_leave_the_table() -> None:
     finding = explain_case(at_the_edge(clearance=0.01, speed=1.5))
-    assert finding.kind is Kind.INFEASIBLE
+    assert finding.kind is Feasibility.INFEASIBLE
     assert "after the start the tip is" in finding.text
 
 
 def test_the_same_at_the_goal() -> None:
     plan = at_the_edge(clearance=0.01, speed=1.5)
     finding = explain_case(mirrored(plan))
-    assert finding.kind is Kind.INFEASIBLE
+    assert finding.kind is Feasibility.INFEASIBLE
     assert "before the goal the tip is" in finding.text
 
 
 def test_with_more_room_the_proof_gives_way_to_the_verge_and_then_to_nothing() -> None:
     kinds = [explain_case(at_the_edge(clearance, speed=1.0)).kind for clearance in (0.012, 0.014, 0.016)]
-    assert kinds == [Kind.INFEASIBLE, Kind.VERGE, Kind.UNKNOWN]
+    assert kinds == [Feasibility.INFEASIBLE, Feasibility.VERGE, Feasibility.UNKNOWN]
 
 
 def test_an_end_at_rest_near_the_edge_is_not_on_the_verge() -> None:
-    assert explain_case(at_the_edge(clearance=0.0005, speed=0.0)).kind is Kind.UNKNOWN
+    assert explain_case(at_the_edge(clearance=0.0005, speed=0.0)).kind is Feasibility.UNKNOWN
 
 
 def explain_case(plan: Plan) -> Explanation:
@@ -219,16 +219,16 @@ def test_a_motion_that_starts_off_the_table_may_be_that_far_off_for_a_while() ->
 def test_a_start_further_off_the_table_than_allowed_is_infeasible() -> None:
     plan = raised(load("hit"), 6e-3).with_constraint("Table", start_band=0.0, tolerance=3e-3)
     assert "at the start table height is 0.166 m, expected 0.16 m" in explain_case(plan).text
-    assert explain_case(raised(plan, 2e-3)).kind is Kind.UNKNOWN
+    assert explain_case(raised(plan, 2e-3)).kind is Feasibility.UNKNOWN
 
 
 def test_ends_that_break_a_constraint_are_named_with_value_and_bound() -> None:
     hit, transport = load("hit"), load("transport")
     fast = explain(hit, goal_dq=3 * hit.boundary.goal_dq)
-    assert fast.kind is Kind.INFEASIBLE
+    assert fast.kind is Feasibility.INFEASIBLE
     assert fast.text.startswith("at the goal joint velocity is")
     tilted = explain(transport, start_q=transport.boundary.start_q + 0.2)
-    assert tilted.kind is Kind.INFEASIBLE
+    assert tilted.kind is Feasibility.INFEASIBLE
     heavy = explain_case(transport.with_constraint("RobotClearance", radius=0.5))
     assert heavy.text.startswith("at the start robot clearance is")
     assert "expected 0.5 m" in heavy.text
@@ -237,7 +237,7 @@ def test_ends_that_break_a_constraint_are_named_with_value_and_bound() -> None:
 def test_ends_are_held_to_no_more_than_the_verdict_holds_them_to() -> None:
     hit = load("hit")
     limit = hit.robot.acceleration_limit * 1.005
-    for beyond, kind in ((9e-5, Kind.UNKNOWN), (0.1, Kind.INFEASIBLE)):  # 1e-4 rad/s^2 may be missed
+    for beyond, kind in ((9e-5, Feasibility.UNKNOWN), (0.1, Feasibility.INFEASIBLE)):  # 1e-4 rad/s^2 may be missed
         start_ddq = np.zeros((1, 6))
         start_ddq[0, 5] = limit[5] + beyond
         assert explain(hit, start_ddq=start_ddq).kind is kind
@@ -255,10 +255,10 @@ def test_a_goal_whose_torque_no_acceleration_can_lower_is_infeasible() -> None:
     limit = plan.robot.torque_limit.copy()
     limit[joint] = (start[joint] + goal[joint]) / 2
     weak = replace(plan, robot=replace(plan.robot, torque_limit=limit))
-    assert explain_case(weak).kind is Kind.UNKNOWN  # it may arrive braking, which takes load off the joint
+    assert explain_case(weak).kind is Feasibility.UNKNOWN  # it may arrive braking, which takes load off the joint
     slow = replace(weak.robot, acceleration_limit=1e-3 * plan.robot.acceleration_limit)
     finding = explain_case(replace(weak, robot=slow))
-    assert finding.kind is Kind.INFEASIBLE
+    assert finding.kind is Feasibility.INFEASIBLE
     assert finding.text.startswith("at the goal there is no acceleration")
 
 
@@ -270,7 +270,7 @@ def test_a_joint_that_runs_into_its_limit_is_named() -> None:
     only = replace(plan.problem, constraint=plan.problem.constraint[:3])
     ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
     finding = explain_failure(only, plan.robot, replace(plan.boundary, start_q=q, start_dq=dq), **ends)
-    assert finding.kind is Kind.INFEASIBLE
+    assert finding.kind is Feasibility.INFEASIBLE
     assert "joint_6 is" in finding.text
 
 
@@ -280,7 +280,7 @@ def test_boundary_conditions_that_are_no_numbers_are_said_to_be_none() -> None:
 
 
 def test_by_default_the_plans_that_are_not_valid_are_explained() -> None:
-    plans = solved("airhockey-hit", 3).select(np.arange(2))
+    plans = solved("airhockey-hit", 3)[np.arange(2)]
     doubted = replace(plans, status=np.array([1, 2], np.uint8))
     assert list(explain_plans(plans)) == []
     assert list(explain_plans(doubted)) == [1]
@@ -289,7 +289,7 @@ def test_by_default_the_plans_that_are_not_valid_are_explained() -> None:
 
 
 def test_the_commands_explain_plans_that_are_not_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plans = solved("airhockey-hit", 3).select(np.arange(2))
+    plans = solved("airhockey-hit", 3)[np.arange(2)]
     boundary = replace(plans.boundary, goal_dq=plans.boundary.goal_dq * np.array([[1.0], [20.0]]))
     given = tmp_path / "plans.h5"
     save_plans(given, replace(plans, boundary=boundary))

@@ -14,6 +14,7 @@ from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.schema.arguments import flag, integer, number, numbers
+from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.dataset import validate_dataset
 from tests.conftest import tiny_recipe
 from tests.examples.tiny_datasets import make_tiny
@@ -68,6 +69,22 @@ def test_what_is_no_array_of_numbers_is_refused_with_what_it_is(values: Any, why
         numbers("x", values)
 
 
+class Tensor:
+    """What NumPy makes of a tensor that carries a gradient: nothing, until it is detached."""
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise RuntimeError("it requires grad")
+
+    def detach(self) -> np.ndarray:
+        return np.array([1.0, 2.0])
+
+
+def test_a_gradient_is_left_behind_unless_it_must_not_be_lost() -> None:
+    assert numbers("x", Tensor()).tolist() == [1.0, 2.0]
+    with pytest.raises(UsageError, match="x must be an array of numbers, got Tensor: it requires grad"):
+        numbers("x", Tensor(), differentiable=True)
+
+
 def test_yes_and_no_are_booleans_and_nothing_else() -> None:
     assert flag("on", True) is flag("on", np.bool_(True)) is True
     for value in (1, "no", None, [True]):
@@ -95,10 +112,10 @@ def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothi
     assert not list(tmp_path.iterdir())
 
 
-def test_whole_numbers_of_numpy_make_the_plan_of_python_s() -> None:
-    recipe = tiny_recipe("airhockey-hit")
-    plans = [draw_up(recipe, n=kind(50), seed=kind(3), shard_size=kind(20)).blueprint for kind in (int, np.int64)]
-    assert plans[0].fingerprint == plans[1].fingerprint
+def test_whole_numbers_of_numpy_make_the_blueprint_of_python_s(tmp_path: Path) -> None:
+    recipe, place = tiny_recipe("airhockey-hit"), find_workspace(tmp_path)
+    jobs = [draw_up(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20)) for kind in (int, np.int64)]
+    assert jobs[0].blueprint.fingerprint == jobs[1].blueprint.fingerprint
 
 
 @pytest.mark.parametrize("out", [3, b"folder", "", "  "])
@@ -122,9 +139,9 @@ def test_a_pipeline_is_refused_with_the_dataset_recipe_to_make_of_it() -> None:
 
 
 @pytest.mark.parametrize(("splits", "said"), [({}, "has no splits"), ({"train": 9.5}, "split 'train' must be an int")])
-def test_splits_that_no_file_could_have_are_refused(splits: Any, said: str) -> None:
+def test_splits_that_no_file_could_have_are_refused(tmp_path: Path, splits: Any, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        draw_up(replace(tiny_recipe("airhockey-hit"), splits=splits), n=50)
+        draw_up(replace(tiny_recipe("airhockey-hit"), splits=splits), find_workspace(tmp_path), n=50)
 
 
 @pytest.mark.parametrize("regenerate", [1.5, "1", True, -1])

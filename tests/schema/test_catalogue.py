@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.make.load import find_recipe, load_dataset_recipe
+from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.recipe import recipe_digest
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.problems.constraints.constraint import Constraint
@@ -362,6 +362,8 @@ def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
     [
         ("rol", r"unknown pipeline 'rol' \(did you mean 'roll'\?\); known: roll"),
         ("", "unknown pipeline ''; known: roll"),
+        ("arm", "unknown pipeline 'arm', which is a problem; known: roll"),
+        ("roll-1k", "unknown pipeline 'roll-1k', which is a dataset; known: roll"),
         ("rolll.toml", r"no such file: rolll.toml \(did you mean 'roll'\?\)"),
         ("some/roll", "no such file: some/roll"),
         ("/", "/ is a folder, expected a .toml file"),
@@ -370,14 +372,13 @@ def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
 def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RecipeError, match=message):
-        find_recipe("pipeline", text)
+        load_pipeline(text)
 
 
 def test_a_file_without_suffix_is_a_path(shipped, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipelines" / "roll.toml").rename(tmp_path / "pipelines" / "mine")
     monkeypatch.chdir(tmp_path / "pipelines")
-    assert find_recipe("pipeline", "mine") == Path("mine")
     assert load_pipeline("mine").path == tmp_path / "pipelines" / "mine"
 
 
@@ -387,7 +388,7 @@ def test_a_path_is_relative_to_the_folder_that_is_given(files, tmp_path):
 
 def test_a_missing_file_is_not_found_in_the_library_by_its_stem(shipped):
     with pytest.raises(RecipeError, match="no such file"):
-        find_recipe("pipeline", "nowhere/roll.toml")
+        load_pipeline("nowhere/roll.toml")
 
 
 def test_recipes_are_beside_the_package_in_a_checkout_and_inside_it_in_a_wheel(tmp_path, monkeypatch):

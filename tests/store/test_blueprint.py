@@ -16,17 +16,17 @@ from cnpgen.store.blueprint import (
     default_shard_size,
     from_json,
     load_blueprint,
-    save_plan,
     shard_attributes,
     shards,
     to_json,
+    write_blueprint,
 )
 from cnpgen.store.files.documents import save_document
 from tests.examples.store import PLAN
 
 
 def test_a_plan_survives_json_disk_and_pickle(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     assert load_blueprint(tmp_path) == PLAN
     assert from_json(json.loads(json.dumps(to_json(PLAN)))) == PLAN
     assert pickle.loads(pickle.dumps(PLAN)).fingerprint == PLAN.fingerprint
@@ -116,28 +116,13 @@ def test_impossible_plans_are_refused(change: dict[str, Any], message: str) -> N
         replace(PLAN, **change)
 
 
-def test_saving_the_same_plan_again_changes_nothing_and_another_is_refused(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
-    before = (tmp_path / "plan.json").read_bytes()
-    save_plan(tmp_path, replace(PLAN, title="other"))
-    assert (tmp_path / "plan.json").read_bytes() == before
-    with pytest.raises(DatasetError, match="another dataset"):
-        save_plan(tmp_path, replace(PLAN, seed=8))
-
-
-def test_a_folder_with_other_things_is_not_turned_into_a_dataset(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(DatasetError, match="not empty"):
-        save_plan(tmp_path, PLAN)
-
-
 def test_an_unwritable_folder_is_a_machine_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_arguments: object) -> None:
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "fsync", refuse)
     with pytest.raises(MachineError, match="may write"):
-        save_plan(tmp_path / "new", PLAN)
+        write_blueprint(tmp_path / "new", PLAN)
 
 
 def damage(action: Callable[[bytes], bytes], folder: Path) -> None:
@@ -155,7 +140,7 @@ def damage(action: Callable[[bytes], bytes], folder: Path) -> None:
     ids=["empty", "truncated", "flipped"],
 )
 def test_damaged_plans_are_refused_by_name(tmp_path: Path, action: Callable[[bytes], bytes]) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     damage(action, tmp_path)
     with pytest.raises(DatasetError, match=r"plan\.json is damaged"):
         load_blueprint(tmp_path)

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, check_dataset, check_documents
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import save_document
@@ -80,12 +80,12 @@ def test_a_shard_from_another_seed_is_named_as_such(tmp_path: Path, dataset: Pat
     other = tmp_path / "other"
     make_shards(other, replace(PLAN, seed=5))
     shutil.copy(other / TASK.file, dataset / TASK.file)
-    message = f"{TASK.file}: its root_seed is '5', the plan says '{PLAN.seed}'"
+    message = f"{TASK.file}: its root_seed is '5', plan.json says '{PLAN.seed}'"
     assert message in [str(item) for item in check_dataset(dataset)]
     shutil.copy(other / TASK.sidecar, dataset / TASK.sidecar)
     texts = [str(item) for item in check_dataset(dataset)]
     assert message in texts
-    assert any(text.startswith(f"{TASK.sidecar}: belongs to another plan") for text in texts)
+    assert any(text.startswith(f"{TASK.sidecar}: belongs to another blueprint") for text in texts)
     assert {item.file for item in check_dataset(dataset)} == {TASK.file, TASK.sidecar}
     assert {item.advice for item in check_dataset(dataset)} == {MAKE_AGAIN}
     (dataset / "manifest.json").unlink()
@@ -99,7 +99,7 @@ def test_swapped_shards_are_found(dataset: Path) -> None:
     last.write_bytes(content)
     assert problems(dataset).keys() == {TASK.file, shards(PLAN)[-1].file}
     texts = [str(item) for item in check_content(dataset, PLAN, TASK)]
-    assert any("its split is 'validation', the plan says 'train'" in text for text in texts)
+    assert any("its split is 'validation', plan.json says 'train'" in text for text in texts)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_swapped_shards_are_found(dataset: Path) -> None:
         (lambda file: file["start_q"].attrs.__setitem__("offset", 3), "field 'start_q' has offset"),
         (lambda file: file.move("clearance", "margin"), "lacks the field 'clearance'"),
         (lambda file: file.move("clearance", "margin"), "has an unknown field 'margin'"),
-        (lambda file: file.attrs.__setitem__("first_sample_id", 3), "its first_sample_id is 3, the plan says 0"),
+        (lambda file: file.attrs.__setitem__("first_sample_id", 3), "its first_sample_id is 3, plan.json says 0"),
     ],
 )
 def test_shards_that_contradict_the_plan_are_found(
@@ -142,7 +142,7 @@ def test_files_that_do_not_belong_to_the_dataset_are_notes(dataset: Path) -> Non
 
 
 def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     for task in shards(PLAN)[:2]:
         make_shard(tmp_path, PLAN, task)
     message = "is missing: the dataset is unfinished: 2 of 3 shards are there; run the same make-dataset command again"
@@ -170,7 +170,7 @@ def test_a_damaged_manifest_does_not_hide_a_damaged_shard(dataset: Path) -> None
 def test_manifests_that_contradict_the_plan_or_themselves_are_found(tmp_path: Path, dataset: Path) -> None:
     good = load_manifest(dataset)
     cases = [
-        ({"plan_fingerprint": "0" * 64}, "another plan"),
+        ({"plan_fingerprint": "0" * 64}, "another blueprint"),
         ({"fingerprint": "0" * 64}, "its fingerprint is not"),
         ({"splits": {"train": good["splits"]["train"]}}, "lists other shards"),
     ]
@@ -211,5 +211,5 @@ def test_changed_documents_are_found_without_reading_a_shard(
 
 
 def test_a_dataset_that_is_finished_again_is_good(dataset: Path) -> None:
-    finalize(dataset)
+    finalize(dataset, PLAN)
     assert check_dataset(dataset) == []

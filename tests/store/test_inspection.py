@@ -11,8 +11,8 @@ import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
+from cnpgen.store.fates import DensityMap, Fates
 from cnpgen.store.inspection import inspect_dataset
-from cnpgen.store.outcome import DensityMap, Fates
 from cnpgen.store.plot import plot_dataset
 from cnpgen.store.reader import open_dataset
 
@@ -157,7 +157,7 @@ def test_an_unfinished_dataset_is_drawn(unfinished, tmp_path):
 def test_a_density_map_over_a_single_point_is_drawn(hits, tmp_path, monkeypatch):
     found = inspect_dataset(hits)
     density = DensityMap((0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64))
-    monkeypatch.setitem(vars(found.summary), "outcome", Fates(tried=0, accepted=0, densities={"start_xyz": density}))
+    monkeypatch.setitem(vars(found.summary), "fates", Fates(tried=0, accepted=0, densities={"start_xyz": density}))
     plot_dataset(found, tmp_path / "point.png")
     assert (tmp_path / "point.png").exists()
 

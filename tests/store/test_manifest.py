@@ -14,12 +14,12 @@ import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store import manifest as manifest_module
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.check import check_dataset
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
 from cnpgen.store.record import commit_shard
-from tests.examples.store import FIELDS, PLAN, dataset, make_columns, make_outcome, make_shard, make_shards
+from tests.examples.store import FIELDS, PLAN, dataset, make_columns, make_fates, make_shard, make_shards
 
 __all__ = ["dataset"]
 
@@ -73,14 +73,14 @@ def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
 
 def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
     before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
-    finalize(dataset, notes="Some notes.")
+    finalize(dataset, PLAN, notes="Some notes.")
     assert {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()} == before
     assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
 
 
 def test_finishing_in_several_processes_at_once_gives_a_good_dataset(dataset: Path) -> None:
     with multiprocessing.get_context("spawn").Pool(3) as pool:
-        manifests = pool.map(finalize, [dataset] * 9)
+        manifests = pool.starmap(finalize, [(dataset, PLAN)] * 9)
     assert check_dataset(dataset) == []
     assert manifests == [load_manifest(dataset)] * 9
 
@@ -90,31 +90,31 @@ def test_records_without_a_start_are_dated_by_the_clock_and_nonsense_is_refused(
     task = shards(plan)[0]
     for started, good in (("", True), ("yesterday", False)):
         folder = tmp_path / str(good)
-        save_plan(folder, plan)
-        commit_shard(folder, plan, task, columns=make_columns(task), outcome=make_outcome(task), started=started)
+        write_blueprint(folder, plan)
+        commit_shard(folder, plan, task, columns=make_columns(task), fates=make_fates(task), started=started)
         if good:
-            assert finalize(folder)["created"].endswith("Z")
+            assert finalize(folder, plan)["created"].endswith("Z")
         else:
             with pytest.raises(DatasetError, match="yesterday"):
-                finalize(folder)
+                finalize(folder, plan)
 
 
 def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1763690000")
-    assert finalize(dataset)["created"] == "2025-11-21T01:53:20Z"
+    assert finalize(dataset, PLAN)["created"] == "2025-11-21T01:53:20Z"
     first = (dataset / "manifest.json").read_bytes()
-    finalize(dataset)
+    finalize(dataset, PLAN)
     assert (dataset / "manifest.json").read_bytes() == first
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     with pytest.raises(UsageError, match="SOURCE_DATE_EPOCH must be whole seconds since 1970, got 'yesterday'"):
-        finalize(dataset)
+        finalize(dataset, PLAN)
 
 
 def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError) as caught:
-        finalize(tmp_path)
+        finalize(tmp_path, PLAN)
     assert "1 of 3 shards are there; run the same make-dataset command again" in str(caught.value)
     assert "train/shard-00000.json is missing" in str(caught.value)
     assert "validation/shard-00000.json is missing" in str(caught.value)
@@ -123,9 +123,8 @@ def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_pa
 
 
 def test_a_long_list_of_missing_shards_is_cut_short(tmp_path: Path) -> None:
-    save_plan(tmp_path, replace(PLAN, splits={"train": 320}))
     with pytest.raises(DatasetError, match="and 5 more"):
-        finalize(tmp_path)
+        finalize(tmp_path, replace(PLAN, splits={"train": 320}))
 
 
 def test_shards_of_another_seed_and_cut_off_shards_are_refused(tmp_path: Path) -> None:
@@ -134,9 +133,9 @@ def test_shards_of_another_seed_and_cut_off_shards_are_refused(tmp_path: Path) -
     path = tmp_path / shards(PLAN)[1].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
-        DatasetError, match=r"(?s)00000\.json belongs to another plan.*00001\.h5 is not the recorded file"
+        DatasetError, match=r"(?s)00000\.json belongs to another blueprint.*00001\.h5 is not the recorded file"
     ):
-        finalize(tmp_path)
+        finalize(tmp_path, PLAN)
 
 
 @pytest.mark.parametrize("step", ["save_document", "write_file", "_manifest"])
@@ -148,10 +147,10 @@ def test_a_finalize_that_is_killed_leaves_no_manifest(
 
     monkeypatch.setattr(manifest_module, step, killed)
     with pytest.raises(KeyboardInterrupt):
-        finalize(dataset)
+        finalize(dataset, PLAN)
     assert not (dataset / "manifest.json").exists()
     monkeypatch.undo()
-    finalize(dataset)
+    finalize(dataset, PLAN)
     assert (dataset / "manifest.json").exists()
 
 
@@ -162,7 +161,7 @@ def test_a_full_disk_while_finishing_is_a_machine_error(tmp_path: Path, monkeypa
     make_shards(tmp_path)
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(MachineError, match=r"stats\.json"):
-        finalize(tmp_path)
+        finalize(tmp_path, PLAN)
     assert not (tmp_path / "manifest.json").exists()
 
 
@@ -174,8 +173,9 @@ def test_damaged_manifests_are_refused(dataset: Path, damage: bytes) -> None:
 
 
 def test_datasets_with_an_empty_split_are_finished_like_any_other(tmp_path: Path) -> None:
-    make_shards(tmp_path, replace(PLAN, splits={"train": 20, "validation": 0}))
-    manifest = finalize(tmp_path)
+    blueprint = replace(PLAN, splits={"train": 20, "validation": 0})
+    make_shards(tmp_path, blueprint)
+    manifest = finalize(tmp_path, blueprint)
     assert manifest["splits"]["validation"]["shards"] == []
     assert "validation/*.h5" not in (tmp_path / "README.md").read_text()
 
@@ -190,6 +190,20 @@ def test_croissant_lists_the_files_and_promises_no_records(dataset: Path) -> Non
         assert item["encodingFormat"] == "application/x-hdf5"
         assert item["contentSize"] == f"{len(content)} B"
         assert item["sha256"] == hashlib.sha256(content).hexdigest()
+
+
+def test_croissant_says_the_unit_of_every_field(dataset: Path) -> None:
+    croissant = json.loads((dataset / "croissant.json").read_text())
+    vocabulary = croissant["@context"]["@vocab"]
+    assert vocabulary == croissant["@context"]["sc"] == "https://schema.org/"
+    variables = croissant["variableMeasured"]
+    assert {item["@type"] for item in variables} == {"sc:PropertyValue"}
+    assert {item["name"]: item["unitText"] for item in variables} == {field.name: field.unit for field in PLAN.fields}
+    start, goal, clearance, number = variables
+    assert start["description"] == "initial joint positions (j1, j2, j3)"
+    assert (start["minValue"], start["maxValue"]) == (-2.0, 2.0)
+    assert (clearance["description"], clearance["minValue"]) == ("smallest distance", 0.0)
+    assert not {"minValue", "maxValue"} & (goal.keys() | number.keys())
 
 
 def test_the_card_says_what_the_fields_are_and_what_was_rejected(dataset: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from cnpgen.errors import DatasetError
 from cnpgen.loader.load import load_dataset
 from cnpgen.store import intact
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 from tests.examples.store import PLAN, dataset, make_columns, make_shard
@@ -61,11 +61,11 @@ def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
 
 
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
     make_shard(tmp_path, PLAN, shards(PLAN)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run the same"):
         open_dataset(tmp_path)
-    opened = open_dataset(tmp_path, allow_partial=True)
+    opened = open_dataset(tmp_path, allow_incomplete=True)
     assert opened.manifest is None
     assert opened.read("train")["sample_id"].tolist() == list(range(32, 50))
     assert opened.read("validation")["start_q"].shape == (0, 3)
@@ -98,7 +98,7 @@ def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset:
     change_a_number(dataset / second.file)
     if not finished:
         (dataset / "manifest.json").unlink()
-    opened = open_dataset(dataset, allow_partial=not finished)
+    opened = open_dataset(dataset, allow_incomplete=not finished)
     assert len(opened.read("train", stop=32)["start_q"]) == 32  # the other shard is good
     with pytest.raises(DatasetError) as by_rows:
         opened.read("train", start=40)
@@ -127,7 +127,7 @@ def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypat
 def test_a_folder_that_mixes_two_datasets_is_refused(tmp_path: Path, dataset: Path) -> None:
     from dataclasses import replace
 
-    save_plan(tmp_path / "other", replace(PLAN, seed=1))
+    write_blueprint(tmp_path / "other", replace(PLAN, seed=1))
     (dataset / "plan.json").write_bytes((tmp_path / "other" / "plan.json").read_bytes())
     with pytest.raises(DatasetError, match="mixes two datasets"):
         open_dataset(dataset)

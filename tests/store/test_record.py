@@ -1,4 +1,4 @@
-"""Sidecars and outcomes: the commit record of a shard."""
+"""Sidecars and fates: the commit record of a shard."""
 
 import json
 import os
@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.store.blueprint import save_plan, shards
+from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.check import check_dataset
+from cnpgen.store.fates import DensityMap, Fates, fates_from_json, merge_fates
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize
-from cnpgen.store.outcome import DensityMap, Fates, merge_fates, outcome_from_json
 from cnpgen.store.record import (
     commit_shard,
     is_committed,
@@ -26,7 +26,7 @@ from cnpgen.store.record import (
     record_to_json,
     save_record,
 )
-from tests.examples.store import PLAN, make_columns, make_outcome, make_shard, make_shards
+from tests.examples.store import PLAN, make_columns, make_fates, make_shard, make_shards
 
 TASK = shards(PLAN)[0]
 
@@ -39,7 +39,7 @@ def test_a_committed_shard_has_a_record_that_describes_it(tmp_path: Path) -> Non
     assert record.bytes == (tmp_path / "train/shard-00000.h5").stat().st_size
     assert (record.rows, record.first_sample_id, record.seconds) == (32, 0, 0.5)
     assert record.statistics["start_q"].count == 32
-    assert list(record.outcome.rejections) == ["no IK", "collision"]
+    assert list(record.fates.rejections) == ["no IK", "collision"]
 
 
 def test_making_a_shard_twice_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_making_a_shard_twice_gives_the_same_bytes(tmp_path: Path) -> None:
 def test_a_committed_shard_and_its_sidecar_are_not_written_again(tmp_path: Path) -> None:
     make_shard(tmp_path, PLAN, TASK)
     before = [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)]
-    record = commit_shard(tmp_path, PLAN, TASK, columns=make_columns(TASK), outcome=make_outcome(TASK), seconds=9.0)
+    record = commit_shard(tmp_path, PLAN, TASK, columns=make_columns(TASK), fates=make_fates(TASK), seconds=9.0)
     assert record.seconds == 0.5
     assert [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)] == before
 
@@ -74,7 +74,7 @@ def test_the_shard_is_there_before_its_sidecar(tmp_path: Path, monkeypatch: pyte
 def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> None:
     columns = make_columns(TASK) | {"clearance": np.full(32, np.nan)}
     with pytest.raises(DatasetError, match="not finite"):
-        commit_shard(tmp_path, PLAN, TASK, columns=columns, outcome=make_outcome(TASK))
+        commit_shard(tmp_path, PLAN, TASK, columns=columns, fates=make_fates(TASK))
     assert not list(tmp_path.rglob("*"))
 
 
@@ -83,12 +83,12 @@ def test_a_run_that_finishes_the_dataset_does_not_stop_another_one_in_the_middle
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flush: int
 ) -> None:
     sync, calls = os.fsync, count()
-    save_plan(tmp_path, PLAN)
+    write_blueprint(tmp_path, PLAN)
 
     def meanwhile(descriptor: int) -> None:
         if next(calls) == flush:
             make_shards(tmp_path)
-            finalize(tmp_path)
+            finalize(tmp_path, PLAN)
         sync(descriptor)
 
     with monkeypatch.context() as patch:
@@ -124,7 +124,7 @@ def test_a_flipped_digit_in_a_sidecar_is_noticed(tmp_path: Path) -> None:
 def test_missing_shards_and_those_of_another_plan_are_not_committed(tmp_path: Path) -> None:
     assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
     make_shard(tmp_path, PLAN, TASK)
-    with pytest.raises(DatasetError, match="another plan"):
+    with pytest.raises(DatasetError, match="another blueprint"):
         load_committed(tmp_path, TASK, replace(PLAN, seed=1).fingerprint)
     (tmp_path / TASK.file).unlink()
     assert not is_committed(tmp_path, TASK, PLAN.fingerprint)
@@ -155,12 +155,12 @@ def test_pending_lists_what_is_still_to_be_made(tmp_path: Path) -> None:
     assert pending(tmp_path, PLAN) == [TASK]
 
 
-def test_outcomes_survive_json() -> None:
-    content: dict[str, Any] = make_outcome(TASK).to_json()
-    assert outcome_from_json(json.loads(json.dumps(content))).to_json() == content
+def test_fates_survive_json() -> None:
+    content: dict[str, Any] = make_fates(TASK).to_json()
+    assert fates_from_json(json.loads(json.dumps(content))).to_json() == content
 
 
-def test_merged_outcomes_add_up_and_keep_the_worst_violation_and_the_pipeline_s_order() -> None:
+def test_merged_fates_add_up_and_keep_the_worst_violation_and_the_pipeline_s_order() -> None:
     grid = DensityMap((0.0, 1.0), (0.0, 1.0), np.ones((2, 2), np.int64), np.zeros((2, 2), np.int64))
     parts = [
         Fates(tried=5, accepted=2, rejections={"a": 2, "c": 1}, verification={"g": 0.1}),

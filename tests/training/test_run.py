@@ -143,7 +143,7 @@ def test_a_finished_model_is_returned_as_it_is_and_another_one_is_replaced_only_
         ({"steps": 31}, r"length\.steps \(30, now 31\)"),
         ({"check_rows": 3}, r"check_rows \(2, now 3\)"),
     ):
-        with pytest.raises(UsageError, match=rf"model\.h5 is another model.*{differs}.*--force"):
+        with pytest.raises(UsageError, match=rf"model\.h5 is another model.*{differs}.*force=True"):
             train(**options)
     assert (tmp_path / "model.h5").read_bytes() == before
     assert train(steps=31, force=True).model.training["steps"] == 31
@@ -157,7 +157,7 @@ def test_a_place_where_no_model_can_go_is_refused_before_any_work(train, out):
 
 def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
     (tmp_path / "model.h5").write_bytes(b"mine")
-    with pytest.raises(UsageError, match=r"model\.h5 exists and is no model.*--force"):
+    with pytest.raises(UsageError, match=r"model\.h5 exists and is no model.*force=True"):
         train()
     assert (tmp_path / "model.h5").read_bytes() == b"mine"
 
@@ -272,7 +272,7 @@ def test_the_log_is_never_half_written_over(train, tmp_path, monkeypatch):
 def test_files_of_others_beside_the_model_are_not_replaced_without_force(train, tmp_path, name):
     path = tmp_path / name
     path.write_text('{"step": 1, "my": "data"}\n')
-    with pytest.raises(UsageError, match=rf"{name} is there.*--force replaces it"):
+    with pytest.raises(UsageError, match=rf"{name} is there.*force=True replaces it"):
         train(begin=lambda *_: pytest.fail("trained"))
     assert path.read_text() == '{"step": 1, "my": "data"}\n'
     assert train(force=True).made

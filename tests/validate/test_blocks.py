@@ -16,8 +16,8 @@ def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     real = blocks.shard_columns
 
     def shard_columns(*arguments):
-        for columns, outcome in real(*arguments):
-            yield {**columns, "start_q": columns["start_q"] + 1e-3}, outcome
+        for columns, fates in real(*arguments):
+            yield {**columns, "start_q": columns["start_q"] + 1e-3}, fates
 
     monkeypatch.setattr(blocks, "shard_columns", shard_columns)
     return damaged

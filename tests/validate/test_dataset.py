@@ -57,7 +57,7 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
         statistics = column_statistics(columns, plan.fields)
     size, digest = (folder / file).stat().st_size, file_sha256(folder / file)
     save_record(folder, task, replace(record, bytes=size, sha256=digest, statistics=statistics))
-    finalize(folder)
+    finalize(folder, plan)
 
 
 # --- good datasets ----------------------------------------------------------------------------------------------------

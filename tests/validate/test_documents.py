@@ -45,5 +45,5 @@ def test_statistics_must_sum_up_the_records_of_the_shards(damaged):
     assert (finding.file, finding.problem) == (STATS, "does not sum up the shards' records: splits differ")
     report = validate_dataset(damaged, deep=True, workers=1)
     assert finding in report.findings
-    finalize(damaged)
+    finalize(damaged, plan)
     assert validate_dataset(damaged, deep=True, workers=1).findings == ()

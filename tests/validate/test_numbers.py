@@ -81,7 +81,7 @@ def test_rows_must_be_counted_and_draws_add_up(shard):
     (first,) = changed(shard, "sample_id", 4, 3)
     assert first == "sample_id does not count the rows of the split"
     shard[2]["sample_id"][4] = 254
-    tried = shard[3].outcome.tried
+    tried = shard[3].fates.tried
     (second,) = changed(shard, "attempts", 4, shard[2]["attempts"][4] + 1)
     assert second == f"attempts sum to {tried + 1}, but {tried} draws are recorded"
 

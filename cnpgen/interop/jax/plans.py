@@ -1,6 +1,6 @@
 """Plans with gradients: control points from a network's outputs, and their loss; both may be jitted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -54,7 +54,7 @@ def plan_loss(
     path: jax.Array,
     rate: jax.Array,
     *,
-    weights: jax.Array | ArrayLike,
+    weights: jax.Array | ArrayLike | Mapping[str, float],
     tops: jax.Array | ArrayLike | None = None,
     start_tip: jax.Array | ArrayLike | None = None,
     shift: jax.Array | float = 0.0,
@@ -68,7 +68,7 @@ def plan_loss(
         loss: The loss; its ``dtype`` is the precision of values and gradients.
         path: Path control points [rad], shape (N, C, n), of any type.
         rate: Rate control points [1/s], shape (N, R), positive.
-        weights: Weight of every constraint term (e^alpha), shape (m,).
+        weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, as ``PlanLoss`` takes them.
         tops: Heights of the obstacles' upper faces [m], shape (N, obstacles). Like those that follow, a constant, but
             under ``jit`` it may be an argument.
         start_tip: Positions of the tip at the start [m], shape (N, 3).
@@ -85,6 +85,7 @@ def plan_loss(
         raise UsageError('JAX would shorten a loss in float64: jax.config.update("jax_enable_x64", True) keeps it')
     if not isinstance(shift, jax.core.Tracer):
         check_quadrature(loss.rule, loss.nodes, number("shift", shift))
+    weights = loss.in_order(weights)
     if not isinstance(weights, jax.core.Tracer):
         loss.checked_weights(weights)
     given = {"path": path, "rate": rate, "weights": weights, "tops": tops, "start_tip": start_tip}
@@ -179,7 +180,7 @@ def _real(name: str, values: Any, dtype: Any) -> jax.Array:
     Raises:
         UsageError: These are no real numbers.
     """
-    array = values if isinstance(values, jax.Array) else jnp.asarray(numbers(name, values))
+    array = values if isinstance(values, jax.Array) else jnp.asarray(numbers(name, values, differentiable=True))
     if jnp.iscomplexobj(array):
         raise UsageError(f"{name} must be real numbers, got {array.dtype}")
     return array.astype(dtype)

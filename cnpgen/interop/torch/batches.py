@@ -1,16 +1,10 @@
-"""Batches as tensors on NumPy's memory, alone and through a ``DataLoader``.
-
-What a ``DataLoader`` does with a type of its own is said in ``default_collate_fn_map``: the documentation of torch's
-``default_collate`` has users change it in place, and gives no other path to it than the one below, which looks private.
-It is changed where batches are iterated, in every worker, and not when this module is imported.
-"""
+"""Batches as tensors on NumPy's memory, alone and through a ``DataLoader``."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
 from torch.utils import data
-from torch.utils.data._utils.collate import default_collate_fn_map
 
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
@@ -50,6 +44,26 @@ class TensorBatch(dict[str, torch.Tensor]):
         integers = {field.name: self[field.name].to(**there) for field in self.layout.integers}
         return TensorBatch(self.table.to(**there), self.layout, integers)
 
+    def update(self, *fields: Any, **more: torch.Tensor) -> None:
+        """Replace fields by others of the same shape: a batch has the rows of its table.
+
+        Raises:
+            UsageError: A shape is another one. So is that of batches which torch's ``default_collate`` has stacked.
+        """
+        new = dict(*fields, **more)
+        for name, values in new.items():
+            if name in self and values.shape != self[name].shape:
+                raise UsageError(
+                    f"field {name!r} of a batch must keep its shape {tuple(self[name].shape)}, got"
+                    f" {tuple(values.shape)}: these are batches already, give the DataLoader of a BatchDataset"
+                    " batch_size=None"
+                )
+        super().update(new)
+
+    def __repr__(self) -> str:
+        kind = f"{self.table.dtype} on {self.table.device}"
+        return f"<batch of {len(self.table)} rows, {kind}: {self.layout.summary}>"
+
 
 def to_torch(batch: Batch) -> TensorBatch:
     """Give a batch as tensors on its own memory."""
@@ -57,16 +71,15 @@ def to_torch(batch: Batch) -> TensorBatch:
     return TensorBatch(torch.from_numpy(batch.table), batch.layout, integers)
 
 
-def _refuse_batch(*_: Any, **__: Any) -> None:
-    raise UsageError("these are batches already: give the DataLoader of a BatchDataset batch_size=None")
-
-
 class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
-    """Batches for a ``DataLoader(..., batch_size=None)``: every loop gives the rest of an epoch.
+    """Batches as tensors: every loop gives the rest of an epoch. Use it as it is, or in a ``DataLoader``.
 
-    With DataLoader workers the order is the same, and every loop begins the next epoch, also after one that was left
-    early; workers that live on are told of it by :meth:`set_epoch`, but not of a state that is loaded later. As each
-    worker reads all shards, they cost more than they bring.
+    Its ``state_dict`` says where it is, to the batch. Trainers that look for one (Lightning) save it in their
+    checkpoints and resume there.
+
+    A ``DataLoader`` needs ``batch_size=None``. With workers the order is the same, and every loop begins the next
+    epoch, also after one that was left early; workers that live on are told of it by :meth:`set_epoch`, but not of a
+    state that is loaded later. As each worker reads all shards, they cost more than they bring.
 
     Args:
         batches: What ``dataset.batches(...)`` returned.
@@ -78,12 +91,12 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         # Workers have copies of the position, which may end with them. So each notes in shared memory which epoch it
         # has to give next, and how often the position had been set when it did: a position set later counts instead.
         self._next = torch.full((MOST_WORKERS, 2), -1).share_memory_()
+        batches.taken_elsewhere.append(self._taken_by_workers)
 
     def __len__(self) -> int:
         return len(self.batches)
 
     def __iter__(self) -> Iterator[TensorBatch]:
-        default_collate_fn_map[TensorBatch] = _refuse_batch  # else torch would stack batches to shape (1, B, ...)
         worker = data.get_worker_info()
         if worker is None:
             return map(to_torch, self.batches)
@@ -100,3 +113,26 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
         if self.batches.epoch != epoch:
             self.batches.epoch = epoch
         self._next.copy_(torch.tensor([epoch, -1]))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Say where it is: after the last batch handed out, as ``Batches.state`` does.
+
+        Raises:
+            UsageError: Workers took the batches, so that nobody here knows which of them were used.
+        """
+        if data.get_worker_info() is not None:
+            raise UsageError("the worker of a DataLoader cannot say which batches were used: leave num_workers at 0")
+        return self.batches.state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to where ``state_dict`` was called: the next loop begins with the batch after it.
+
+        Raises:
+            UsageError: This is not the state of a loader, or from there on the last batch has fewer rows than ranks.
+            DatasetError: It is of another dataset or split.
+        """
+        self.batches.load_state(state)
+
+    def _taken_by_workers(self) -> bool:
+        """Say whether workers took batches since the position was last set."""
+        return bool((self._next[:, 1] == self.batches.times_set).any())

@@ -1,6 +1,6 @@
 """Plans with gradients: control points from a network's outputs, and their loss."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -58,7 +58,7 @@ def plan_loss(
     path: torch.Tensor,
     rate: torch.Tensor,
     *,
-    weights: "torch.Tensor | ArrayLike",
+    weights: "torch.Tensor | ArrayLike | Mapping[str, float]",
     tops: "torch.Tensor | ArrayLike | None" = None,
     start_tip: "torch.Tensor | ArrayLike | None" = None,
     shift: float = 0.0,
@@ -72,7 +72,7 @@ def plan_loss(
         loss: The loss; its ``dtype`` is the precision of values and gradients.
         path: Path control points [rad], shape (N, C, n), on any device, of any type.
         rate: Rate control points [1/s], shape (N, R), positive.
-        weights: Weight of every constraint term (e^alpha), shape (m,).
+        weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, as ``PlanLoss`` takes them.
         tops: Heights of the obstacles' upper faces [m], shape (N, obstacles); a constant.
         start_tip: Positions of the tip at the start [m], shape (N, 3); a constant.
         shift: Of the quadrature nodes, in [0, 1).
@@ -85,7 +85,7 @@ def plan_loss(
         UsageError: A shape is wrong, or a weight is negative or not finite.
     """
     path = _tensor("path", path)
-    given = (path, _tensor("rate", rate), _tensor("weights", weights))
+    given = (path, _tensor("rate", rate), _tensor("weights", loss.in_order(weights)))
     host = tuple(each.to("cpu", getattr(torch, loss.dtype)) for each in given)
     wanted = torch.is_grad_enabled() and (host[0].requires_grad or host[1].requires_grad)
     options = {"tops": _array(tops), "start_tip": _array(start_tip), "shift": shift, "gradient": wanted}
@@ -162,7 +162,7 @@ def _tensor(name: str, values: Any) -> torch.Tensor:
         UsageError: These are no real numbers.
     """
     if not isinstance(values, torch.Tensor):
-        return torch.tensor(numbers(name, values))
+        return torch.tensor(numbers(name, values, differentiable=True))
     if values.is_complex():
         raise UsageError(f"{name} must be real numbers, got {values.dtype}")
     return values

@@ -1,15 +1,9 @@
-"""How near one motion comes to every bound: of its boundary conditions and of the problem's constraints."""
+"""How near one motion comes to every bound: of its boundary conditions and of the problem's constraints.
 
-from typing import TYPE_CHECKING
+A margin is measured of each, where the motion comes closest to the bound or is furthest beyond, and is named by joint,
+axis or obstacle.
+"""
 
-from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
-from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
-
-if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, cast
 
@@ -19,6 +13,11 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.course import Course
 from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
@@ -35,6 +34,7 @@ BOUNDARY = {
     "dq": ("boundary velocity", "rad/s", 1e-6),
     "ddq": ("boundary acceleration", "rad/s^2", 1e-4),
 }
+_PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointTorque
 
 
 def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:
@@ -137,10 +137,7 @@ def by_name(margins: list[Margin]) -> dict[str, Margin]:
     return found
 
 
-_PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointTorque
-
-
-def name_part(problem: "Problem", constraint: Constraint, condition: Condition, part: int) -> str:
+def name_part(problem: Problem, constraint: Constraint, condition: Condition, part: int) -> str:
     """Name one of a condition's values; the only one has no name, those of plug-ins are numbered.
 
     Args:

@@ -10,13 +10,18 @@ NOTHING = 1e-200  # stands for an allowed excess of 0, so that the largest exces
 
 
 class Reason(StrEnum):
-    """Why a plan is not valid; one that breaks a constraint has the constraint's own ``reason``."""
+    """Why a plan is not valid; one that breaks a constraint has the constraint's own ``reason``, which is a plain text.
+
+    These are texts, too, and print in the same way wherever they are.
+    """
 
     OK = "ok"
     NOT_FINITE = "not finite"
     RATE = "rate not positive"
     TOO_LONG = "too long"
     BOUNDARY = "boundary conditions"
+
+    __repr__ = str.__repr__
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +137,14 @@ class Verdict:
     metrics: Metrics = Metrics()
     paper: PaperRule = PaperRule()
     samples: int = 0
+
+    def __str__(self) -> str:
+        if self.valid:
+            return "valid"
+        return f"{self.reason} ({self.worst})" if self.worst else str(self.reason)
+
+    def __repr__(self) -> str:
+        return f"<Verdict: {self}>"
 
     @property
     def valid(self) -> bool:

@@ -57,13 +57,13 @@ class BrakingReach(Stage):
         tip = context.kernels.load(tip_state)
         brake = context.kernels.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
+        def work(draws: Round, _random: np.random.Generator) -> None:
             for end, sign in (("start", 1.0), ("goal", -1.0)):
-                q, dq = batch[f"{end}_q"], sign * batch[f"{end}_dq"]
+                q, dq = draws[f"{end}_q"], sign * draws[f"{end}_dq"]
                 excess = overshoot(tip, brake, table, q, dq, margin=self.margin)
-                batch.reject(excess <= -self.margin, f"cannot brake at the {end}")
+                draws.reject(excess <= -self.margin, f"cannot brake at the {end}")
 
-        return run
+        return work
 
 
 def overshoot(

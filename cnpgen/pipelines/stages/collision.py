@@ -2,7 +2,7 @@
 
 An exact test of every capsule's segment against every box comes first and rejects almost all collisions cheaply; Coal
 then judges every sample that is left. The boxes move with the sample, so each becomes a sliding joint of the
-Pinocchio model: one call checks a whole batch without any Python per sample.
+Pinocchio model: one call checks a whole round without any Python per sample.
 """
 
 from dataclasses import dataclass
@@ -65,31 +65,31 @@ class Collision(Stage):
     def _by_segments(self, context: Context, radius: float) -> Work:
         kernel = context.kernels.load(skeleton_distance)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
+        def work(draws: Round, _random: np.random.Generator) -> None:
             for end in self._ends():
-                (distance,) = kernel(batch[f"{end}_q"], sample_tops(context.problem, batch))
-                batch[f"{end}_clearance"] = distance - radius
-                batch.reject(distance[0] > radius, f"arm in collision at the {end}")
+                (distance,) = kernel(draws[f"{end}_q"], sample_tops(context.problem, draws))
+                draws[f"{end}_clearance"] = distance - radius
+                draws.reject(distance[0] > radius, f"arm in collision at the {end}")
 
-        return run
+        return work
 
     def _by_coal(self, context: Context, radius: float) -> Work:
         depth = context.constraint(ObjectContact).depth
         judge = coal_judge(context.problem, context.robot, radius, depth)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
-            tops = sample_tops(context.problem, batch)
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            tops = sample_tops(context.problem, draws)
             hit = judge(
-                np.concatenate([batch[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends()))
+                np.concatenate([draws[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends()))
             )
-            batch.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
+            draws.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
 
-        return run
+        return work
 
 
-def sample_tops(problem: Problem, batch: Round) -> Array:
+def sample_tops(problem: Problem, draws: Round) -> Array:
     """Heights of the obstacles' upper faces for every draw [m], shape (obstacles, n)."""
-    return np.ascontiguousarray(obstacle_tops(problem, batch["start_xyz"].T, batch["goal_xyz"].T).T)
+    return np.ascontiguousarray(obstacle_tops(problem, draws["start_xyz"].T, draws["goal_xyz"].T).T)
 
 
 def skeleton_distance(robot: "Robot", problem: Problem) -> Any:

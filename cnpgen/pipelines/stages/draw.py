@@ -46,13 +46,13 @@ class DrawPositions(Stage):
         """Check that the boxes can be reached and return the draw."""
         self._check_reach(context)
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            batch["start_xyz"] = uniform(batch.draw(random, 3), self.start)
-            batch["goal_xyz"] = uniform(batch.draw(random, 3), self.goal)
-            apart = np.hypot(*(batch["goal_xyz"] - batch["start_xyz"])[:2])
-            batch.reject(apart >= self.min_distance, "too close together")
+        def work(draws: Round, random: np.random.Generator) -> None:
+            draws["start_xyz"] = uniform(draws.draw(random, 3), self.start)
+            draws["goal_xyz"] = uniform(draws.draw(random, 3), self.goal)
+            apart = np.hypot(*(draws["goal_xyz"] - draws["start_xyz"])[:2])
+            draws.reject(apart >= self.min_distance, "too close together")
 
-        return run
+        return work
 
     def _check_reach(self, context: Context) -> None:
         mistakes = []

@@ -43,12 +43,12 @@ class HitAngleToGoal(Stage):
         """Nothing to load."""
         del context
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            x, y = batch["goal_xyz"][:2]
-            noise = self.noise * (2 * batch.draw(random, 1) - 1)
-            batch["hit_angle"] = wrap(np.arctan2(self.target[1] - y, self.target[0] - x) + noise)
+        def work(draws: Round, random: np.random.Generator) -> None:
+            x, y = draws["goal_xyz"][:2]
+            noise = self.noise * (2 * draws.draw(random, 1) - 1)
+            draws["hit_angle"] = wrap(np.arctan2(self.target[1] - y, self.target[0] - x) + noise)
 
-        return run
+        return work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +74,9 @@ class HitAngleInCone(Stage):
         """Nothing to load."""
         del context
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            x, y = (batch["goal_xyz"] - batch["start_xyz"])[:2]
-            noise = self.half_angle * (2 * batch.draw(random, 1) - 1)
-            batch["hit_angle"] = wrap(np.arctan2(y, x) + noise)
+        def work(draws: Round, random: np.random.Generator) -> None:
+            x, y = (draws["goal_xyz"] - draws["start_xyz"])[:2]
+            noise = self.half_angle * (2 * draws.draw(random, 1) - 1)
+            draws["hit_angle"] = wrap(np.arctan2(y, x) + noise)
 
-        return run
+        return work

@@ -47,15 +47,15 @@ class HittingConfiguration(Stage):
             raise RecipeError(["needs three or more planned joints, all of them revolute"])
         search = _Search(context)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
-            n = len(batch.alive)
-            home = batch["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], n, axis=1)
-            direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
-            batch["goal_q"], solved, value = search.solve(batch["goal_xyz"], direction, home)
-            batch.reject(solved, "no hitting configuration")
-            batch.reject(np.isfinite(value[solved]), "joint position limit at the goal")
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            n = len(draws.alive)
+            home = draws["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], n, axis=1)
+            direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
+            draws["goal_q"], solved, value = search.solve(draws["goal_xyz"], direction, home)
+            draws.reject(solved, "no hitting configuration")
+            draws.reject(np.isfinite(value[solved]), "joint position limit at the goal")
 
-        return run
+        return work
 
 
 class _Search:

@@ -65,16 +65,16 @@ class HittingVelocity(Stage):
         """Load the kernel."""
         kernel = context.kernels.load(hitting_velocity)
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            direction = np.concatenate([np.cos(batch["hit_angle"]), np.sin(batch["hit_angle"])])
-            velocity, speed = kernel(batch["goal_q"], direction)
-            factor, choice = batch.draw(random, 1), batch.draw(random, 1)
+        def work(draws: Round, random: np.random.Generator) -> None:
+            direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
+            velocity, speed = kernel(draws["goal_q"], direction)
+            factor, choice = draws.draw(random, 1), draws.draw(random, 1)
             factor = np.where(choice < self.full_speed, 1.0, factor)
-            batch["goal_dq"], batch["hit_speed"], batch["hit_speed_max"] = velocity * factor, speed * factor, speed
+            draws["goal_dq"], draws["hit_speed"], draws["hit_speed_max"] = velocity * factor, speed * factor, speed
             solved = np.isfinite(velocity).all(0) & np.isfinite(speed[0])  # not where the Jacobian is singular
-            batch.reject(solved & (speed[0] >= self.min_speed), "no hitting velocity")
+            draws.reject(solved & (speed[0] >= self.min_speed), "no hitting velocity")
 
-        return run
+        return work
 
 
 def hitting_velocity(robot: "Robot") -> Any:

@@ -41,14 +41,14 @@ class _IK(Stage):
         )
         low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
-            q, error = kernel(batch[initial], batch[f"{end}_xyz"])
-            batch[f"{end}_q"] = q
-            batch.reject(error[0] < TOLERANCE, f"no inverse kinematics of the {end}")
-            q = batch[f"{end}_q"]
-            batch.reject(((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}")
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            q, error = kernel(draws[initial], draws[f"{end}_xyz"])
+            draws[f"{end}_q"] = q
+            draws.reject(error[0] < TOLERANCE, f"no inverse kinematics of the {end}")
+            q = draws[f"{end}_q"]
+            draws.reject(((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}")
 
-        return run
+        return work
 
     def _how(self) -> str:
         return " with the tip's z axis vertical" if self.orientation == "vertical" else ""
@@ -78,11 +78,11 @@ class StartIK(_IK):
         guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
         solve_start = self._solve(context, "start", "guess_q")
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            batch["guess_q"] = uniform(batch.draw(random, n), guess)
-            solve_start(batch, random)
+        def work(draws: Round, random: np.random.Generator) -> None:
+            draws["guess_q"] = uniform(draws.draw(random, n), guess)
+            solve_start(draws, random)
 
-        return run
+        return work
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,11 +49,11 @@ class AtRest(Stage):
         """Nothing to load."""
         n = context.robot.n
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
+        def work(draws: Round, _random: np.random.Generator) -> None:
             for name in (f"{self.end}_dq", f"{self.end}_ddq"):
-                batch[name] = np.zeros((n, len(batch.alive)))
+                draws[name] = np.zeros((n, len(draws.alive)))
 
-        return run
+        return work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,13 +84,13 @@ class TableVelocity(Stage):
         context.constraint(Table)
         kernel, n = context.kernels.load(table_velocity), context.robot.n
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            direction, length, choice = 2 * batch.draw(random, n) - 1, batch.draw(random, 1), batch.draw(random, 1)
+        def work(draws: Round, random: np.random.Generator) -> None:
+            direction, length, choice = 2 * draws.draw(random, n) - 1, draws.draw(random, 1), draws.draw(random, 1)
             length[choice < self.at_rest] = 0.0
-            batch["start_dq"], batch["start_tip_velocity"] = kernel(batch["start_q"], direction, length)
-            batch.reject(np.isfinite(batch["start_dq"]).all(0), "no velocity on the manifold")
+            draws["start_dq"], draws["start_tip_velocity"] = kernel(draws["start_q"], direction, length)
+            draws.reject(np.isfinite(draws["start_dq"]).all(0), "no velocity on the manifold")
 
-        return run
+        return work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,13 +120,13 @@ class TableAcceleration(Stage):
         context.constraint(Table)
         kernel, n = context.kernels.load(table_acceleration), context.robot.n
 
-        def run(batch: Round, random: np.random.Generator) -> None:
-            direction, length = 2 * batch.draw(random, n) - 1, batch.draw(random, 1)
-            acceleration, room = kernel(batch[f"{self.end}_q"], batch[f"{self.end}_dq"], direction, length)
-            batch[f"{self.end}_ddq"] = acceleration
-            batch.reject(room[0] >= 0, f"no acceleration within the limits at the {self.end}")
+        def work(draws: Round, random: np.random.Generator) -> None:
+            direction, length = 2 * draws.draw(random, n) - 1, draws.draw(random, 1)
+            acceleration, room = kernel(draws[f"{self.end}_q"], draws[f"{self.end}_dq"], direction, length)
+            draws[f"{self.end}_ddq"] = acceleration
+            draws.reject(room[0] >= 0, f"no acceleration within the limits at the {self.end}")
 
-        return run
+        return work
 
 
 def table_velocity(robot: "Robot") -> Any:

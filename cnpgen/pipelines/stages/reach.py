@@ -43,16 +43,16 @@ class BallisticReach(Stage):
         """Look up the table."""
         table = context.constraint(Table)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
+        def work(draws: Round, _random: np.random.Generator) -> None:
             if self.start_time:
-                ahead = batch["start_xyz"] + self.start_time * batch["start_tip_velocity"]
-                batch.reject(over(table, ahead), "the start leaves the table")
+                ahead = draws["start_xyz"] + self.start_time * draws["start_tip_velocity"]
+                draws.reject(over(table, ahead), "the start leaves the table")
             if self.goal_time:
-                way = self.goal_time * hit_velocity(batch)
-                position = batch["goal_xyz"][:2]
-                batch.reject(over(table, position + way) & over(table, position - way), "the hit leaves the table")
+                way = self.goal_time * hit_velocity(draws)
+                position = draws["goal_xyz"][:2]
+                draws.reject(over(table, position + way) & over(table, position - way), "the hit leaves the table")
 
-        return run
+        return work
 
 
 def over(table: Table, position: Array) -> NDArray[np.bool_]:
@@ -62,7 +62,7 @@ def over(table: Table, position: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def hit_velocity(batch: Round) -> Array:
+def hit_velocity(draws: Round) -> Array:
     """Horizontal velocity of the tip at the goal [m/s], shape (2, n)."""
-    angle, speed = batch["hit_angle"], batch["hit_speed"]
+    angle, speed = draws["hit_angle"], draws["hit_speed"]
     return np.concatenate([speed * np.cos(angle), speed * np.sin(angle)])

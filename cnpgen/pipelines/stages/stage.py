@@ -1,4 +1,4 @@
-"""The contract of a stage, and the batch of draws that stages work on."""
+"""The contract of a stage, and the round of draws that stages work on."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class Round:
         fate: For every draw of the round, 0 while alive, else 1 + the index of its reason, shape (N,).
         reasons: The reasons seen so far, in order of first use.
         columns: Name -> values of the surviving draws, shape (width, n), contiguous rows.
-        stage: Label of the stage that works on the batch now.
+        stage: Label of the stage that works on the round now.
         origins: Reason -> label of the stage that first gave it.
         drawn: Name -> values of all draws, shape (width, N), for columns written before any rejection.
     """
@@ -71,6 +71,7 @@ class Round:
 
 
 Work = Callable[[Round, np.random.Generator], None]
+"""What a stage does to a round of draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,12 +106,12 @@ class Stage(ABC):
 
     @abstractmethod
     def prepare(self, context: "Context") -> Work:
-        """Load what the stage needs (kernels, geometry) and return the function that works on a batch.
+        """Load what the stage needs (kernels, geometry) and return the function that does its work.
 
         Args:
             context: The problem, its robot and the kernel loader.
 
         Returns:
-            A function of (batch, random) that writes columns and rejects draws. It must use ``batch.draw`` for
-            randomness.
+            A function of (draws, random) that writes columns of a round and rejects draws of it. It must use
+            ``draws.draw`` for randomness.
         """

@@ -42,12 +42,12 @@ class GravityTorque(Stage):
         """Load the kernel."""
         kernel = context.kernels.load(torque_ratio)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
-            (ratio,) = kernel(batch[f"{self.end}_q"])
-            batch[f"{self.end}_torque_ratio"] = ratio
-            batch.reject(ratio[0] <= 1.0, f"joint torque limit at the {self.end}")
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            (ratio,) = kernel(draws[f"{self.end}_q"])
+            draws[f"{self.end}_torque_ratio"] = ratio
+            draws.reject(ratio[0] <= 1.0, f"joint torque limit at the {self.end}")
 
-        return run
+        return work
 
 
 def torque_ratio(robot: "Robot") -> Any:

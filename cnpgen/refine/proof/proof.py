@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 MARGIN = 1e-4  # rad, for what happens between the moments that the verdict looks at, and how exactly it begins
 
 
-class Kind(StrEnum):
+class Feasibility(StrEnum):
     """What is known of a problem without a valid plan."""
 
     INFEASIBLE = "infeasible"
@@ -45,11 +45,11 @@ class Explanation:
         text: What the proof is, or what else is known.
     """
 
-    kind: Kind
+    kind: Feasibility
     text: str
 
     def __str__(self) -> str:
-        """Kind and text in one line."""
+        """Feasibility and text in one line."""
         return f"{self.kind}: {self.text}"
 
 
@@ -67,12 +67,12 @@ def explain_failure(
     """
     values = (start_xyz, goal_xyz, *vars(boundary).values())
     if not all(each is None or np.isfinite(each).all() for each in values):
-        return Explanation(Kind.INFEASIBLE, "the boundary conditions are no numbers")
+        return Explanation(Feasibility.INFEASIBLE, "the boundary conditions are no numbers")
     for mistake in end_mistakes(problem, robot, boundary, start_xyz=start_xyz, goal_xyz=goal_xyz):
-        return Explanation(Kind.INFEASIBLE, mistake)
+        return Explanation(Feasibility.INFEASIBLE, mistake)
     for mistake in _cannot_brake(problem, robot, boundary):
-        return Explanation(Kind.INFEASIBLE, mistake)
-    unknown = Explanation(Kind.UNKNOWN, "nothing proves that there is no valid plan")
+        return Explanation(Feasibility.INFEASIBLE, mistake)
+    unknown = Explanation(Feasibility.UNKNOWN, "nothing proves that there is no valid plan")
     return _off_table(problem, robot, boundary) or unknown
 
 
@@ -90,6 +90,7 @@ def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[in
         UsageError: There is no plan of such an index.
     """
     from cnpgen.plans.status import PlanStatus
+    from cnpgen.plans.tips import settle_tips
     from cnpgen.problems.record import open_problem
 
     if which is None:
@@ -98,6 +99,7 @@ def explain_plans(plans: "Plans", which: Sequence[int] | None = None) -> dict[in
         raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}")
     if not len(which):
         return {}
+    plans = settle_tips(plans)
     problem, robot = open_problem(plans.problem)
     ends = plans.columns["start_xyz"], plans.columns["goal_xyz"]
     return {
@@ -129,9 +131,11 @@ def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Explan
     where, distance = f"{_moment(found.end, found.time)} the tip", f"{1e3 * abs(found.distance):.2g} mm"
     if found.proven:
         text = f"{where} is {distance} or more off the table, however the joints are accelerated"
-        return Explanation(Kind.INFEASIBLE, text)
+        return Explanation(Feasibility.INFEASIBLE, text)
     room = f"has {distance} of the table left" if found.distance < 0 else f"is {distance} off the table"
-    return Explanation(Kind.VERGE, f"{where} {room} at best, as far as a local search without tolerances can tell")
+    return Explanation(
+        Feasibility.VERGE, f"{where} {room} at best, as far as a local search without tolerances can tell"
+    )
 
 
 def _moment(end: str, time: float) -> str:

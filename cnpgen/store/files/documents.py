@@ -7,7 +7,8 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import read_file, write_file
 
+SHOWN = 80  # characters of two values that a message still shows
 _BLANK = "0" * 64
 _SCALARS = frozenset({int, bool, str, type(None)})  # types that are JSON's own, whatever the value
 _SEAL = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
@@ -47,6 +49,38 @@ def canonical_sha256(value: Any) -> str:
     """Compute the sha256 of a value's compact JSON with sorted keys: equal values, equal digits."""
     text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Where two JSON-able values differ; as text, the values only where they are short.
+
+    Attributes:
+        key: Dotted key, ``"robot.name"``.
+        found: The value there in the first one, None where it is missing.
+        wanted: The value there in the second one, None where it is missing.
+    """
+
+    key: str
+    found: Any
+    wanted: Any
+
+    @property
+    def is_short(self) -> bool:
+        """Whether the values are short enough for a message."""
+        return len(repr(self.found)) + len(repr(self.wanted)) < SHOWN
+
+    def __str__(self) -> str:
+        return f"{self.key} ({self.found!r}, now {self.wanted!r})" if self.is_short else self.key
+
+
+def differences(found: Any, wanted: Any, key: str = "") -> Iterator[Difference]:
+    """List where two JSON-able values differ, table by table, in the order of the first one's keys."""
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        for name in [*found, *(name for name in wanted if name not in found)]:
+            yield from differences(found.get(name), wanted.get(name), f"{key}.{name}" if key else name)
+    elif found != wanted:
+        yield Difference(key, found, wanted)
 
 
 def render(value: Any, indent: str = "") -> str:

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import read_file, write_file
+from cnpgen.store.files.hdf5 import create_hdf5
+from cnpgen.store.files.kind import seeming
 
 BLOCK = 512  # bytes of the seal
 _SEAL = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")
@@ -55,7 +57,7 @@ def seal(content: Content, *, kind: str, version: int) -> bytes:
     import h5py
 
     buffer = io.BytesIO()
-    with h5py.File(_create(buffer)) as file:
+    with h5py.File(create_hdf5(buffer, userblock=BLOCK, alignment=1)) as file:
         for name, values in content.arrays.items():
             file.create_dataset(name, data=values, track_times=False)
         for name, text in content.texts.items():
@@ -83,7 +85,7 @@ def read_sealed(path: Path, *, kind: str, version: int) -> Content:
     head = _SEAL.match(data[:BLOCK])
     what = kind.removeprefix("cnpgen-")
     if head is None:
-        raise DatasetError(f"{path} is not a {what} of cnpgen, or its beginning is damaged")
+        raise DatasetError(f"{path} is not a {what} of cnpgen, or its beginning is damaged{seeming(path)}")
     if head[1].decode() != kind:
         raise DatasetError(f"{path} is a {head[1].decode().removeprefix('cnpgen-')} of cnpgen, not a {what}")
     if int(head[2]) > version:
@@ -96,15 +98,3 @@ def read_sealed(path: Path, *, kind: str, version: int) -> Content:
         values = {name: item[()] for name, item in file.items()}
     texts = {name: value.tobytes().decode() for name, value in values.items() if value.dtype == np.uint8}
     return Content({name: value for name, value in values.items() if name not in texts}, texts)
-
-
-def _create(buffer: io.BytesIO) -> Any:
-    """Create an HDF5 file in ``buffer`` that leaves the first block free and stores no times."""
-    from h5py import h5f, h5fd, h5p
-
-    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
-    creation.set_userblock(BLOCK)
-    creation.set_obj_track_times(False)
-    access.set_fileobj_driver(h5fd.fileobj_driver, buffer)
-    access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
-    return h5f.create(b"sealed", h5f.ACC_TRUNC, creation, access)

@@ -67,7 +67,7 @@ class Fates:
                 raise DatasetError(f"the worst violation of {name!r} must be a finite number, got {worst}")
 
     def merge(self, other: "Fates") -> "Fates":
-        """Return the outcome of both sets of draws: counts add up, the worst violation stays."""
+        """Return the fates of both sets of draws: counts add up, the worst violation stays."""
         reasons = _merged_order(list(self.rejections), list(other.rejections))
         densities = dict(self.densities)
         for name, density in other.densities.items():
@@ -126,8 +126,8 @@ def _density(content: Mapping[str, Any]) -> DensityMap:
     return DensityMap((float(x_low), float(x_high)), (float(y_low), float(y_high)), *counts)
 
 
-def outcome_from_json(content: Mapping[str, Any]) -> Fates:
-    """Rebuild an outcome from its JSON form."""
+def fates_from_json(content: Mapping[str, Any]) -> Fates:
+    """Rebuild fates from its JSON form."""
     return Fates(
         tried=int(content["tried"]),
         accepted=int(content["accepted"]),
@@ -139,7 +139,7 @@ def outcome_from_json(content: Mapping[str, Any]) -> Fates:
 
 
 def merge_fates(parts: Sequence[Fates]) -> Fates:
-    """Merge the outcomes of shards, in the given order; without any, nothing was tried."""
+    """Merge the fates of the draws of shards, in the given order; without any, nothing was tried."""
     merged = Fates(tried=0, accepted=0)
     for part in parts:
         merged = merged.merge(part)

@@ -1,0 +1,55 @@
+"""Plans in rows of a certified dataset: what the verdict says of them, and whether their durations are theirs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.judge import judge
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """What the verdict says of the plans in rows of a certified dataset.
+
+    Attributes:
+        judged: How many plans there are.
+        valid: How many of them are valid.
+        problems: What is wrong, a line each.
+    """
+
+    judged: int = 0
+    valid: int = 0
+    problems: tuple[str, ...] = ()
+
+
+def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
+    """Judge the plans that rows of a certified dataset hold; rows of others hold none.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        columns: Field -> values, shape (rows, width) or (rows,).
+    """
+    if "path_control_points" not in columns:
+        return PlanCheck()
+    rows, spec = len(columns["start_q"]), problem.trajectory
+    motion = Motion(
+        columns["path_control_points"].reshape(rows, -1, robot.n), columns["rate_control_points"], spec.degree
+    )
+    boundary = Boundary.from_batch(columns, None)
+    verdicts = judge(problem, robot, motion, boundary, columns["start_xyz"], columns["goal_xyz"])
+    wrong = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
+    problems = []
+    if wrong:
+        row, reason = wrong[0]
+        problems.append(f"{len(wrong)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
+    if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
+        problems.append("durations are not those of the plans")
+    return PlanCheck(rows, rows - len(wrong), tuple(problems))

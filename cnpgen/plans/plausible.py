@@ -1,0 +1,36 @@
+"""Joint positions that cannot be meant: in degrees, or normalised."""
+
+import warnings
+
+import numpy as np
+
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+
+FAR = 2.0  # from the middle of a joint's range, in halves of it: a whole half range beyond its limit
+
+
+def warn_of_far_joints(robot: Robot, boundary: Boundary, *, stacklevel: int = 3) -> None:
+    """Warn where a start or a goal is so far outside of the joints' limits that its unit is probably another one.
+
+    It is no error: boundary conditions are not judged where they come in, files may hold anything, and the verdict says
+    what is wrong with a plan. Nothing is said of numbers that are not finite.
+
+    Args:
+        robot: The robot.
+        boundary: Boundary conditions, shape (N, n) each.
+        stacklevel: Whose line of code the warning names, as of ``warnings.warn``.
+    """
+    low, high = robot.position_lower, robot.position_upper
+    for name in ("start_q", "goal_q"):
+        q = np.asarray(getattr(boundary, name))
+        far = np.abs(q - (low + high) / 2) > FAR * (high - low) / 2
+        if far.any():
+            plan, joint = np.argwhere(far)[0]
+            value, limits = f"{q[plan, joint]:.6g} rad", f"[{low[joint]:.3g}, {high[joint]:.3g}]"
+            warnings.warn(
+                f"{name} of plan {plan}: {robot.joint_names[joint]} = {value} is far outside of its limits, {limits}:"
+                " joint positions must be in rad, are these degrees, or normalised?",
+                UserWarning,
+                stacklevel=stacklevel,
+            )

@@ -1,1 +1,0 @@
-"""The same programme for CasADi's solvers, to compare with."""

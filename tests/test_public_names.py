@@ -1,0 +1,113 @@
+"""Everything that public functions take and return is public, so that users can name it in their own annotations."""
+
+import ast
+import functools
+import importlib
+import inspect
+import subprocess
+import sys
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import cnpgen
+import cnpgen.plugins
+
+SPECIAL = {"__init__", "__call__", "__getitem__", "__iter__"}
+INNER = {  # classes that public signatures name, but that nobody is meant to make or take apart
+    "Run": "train_model hands it to its hook `begin`, for the progress that the command line shows",
+    "State": "likewise",
+    "Columns": "how a Batch finds its fields, which are asked for by name",
+    "Cut": "made by Dataset.batches",
+    "Form": "made by Dataset.batches",
+    "Position": "made by Dataset.batches",
+    "Scaling": "what Boundary.from_batch needs of a Normalization",
+    "Shard": "what Dataset reads rows from",
+    "ShardReader": "likewise",
+    "SplitShards": "likewise",
+}
+
+
+@functools.cache
+def names_in(module: str) -> dict[str, Any]:
+    """Names of a module, those that it imports for type checkers only as well."""
+    found = dict(vars(importlib.import_module(module)))
+    for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            for line in node.body:
+                if isinstance(line, ast.ImportFrom) and line.module:
+                    home = importlib.import_module(line.module)
+                    found |= {alias.asname or alias.name: getattr(home, alias.name) for alias in line.names}
+    return found
+
+
+def classes_in(hint: Any) -> Iterator[type]:
+    """Classes of cnpgen in an annotation."""
+    for part in hint if isinstance(hint, list | tuple) else typing.get_args(hint):
+        yield from classes_in(part)
+    for each in (hint, typing.get_origin(hint)):
+        if isinstance(each, type) and each.__module__.startswith("cnpgen."):
+            yield each
+
+
+def functions_of(kind: type) -> Iterator[FunctionType]:
+    """Methods and properties that users call."""
+    for name, member in vars(kind).items():
+        if name in SPECIAL or not name.startswith("_"):
+            inner = member.fget if isinstance(member, property) else getattr(member, "func", member)
+            function = inspect.unwrap(getattr(inner, "__func__", inner))
+            if inspect.isfunction(function) and function.__module__.startswith("cnpgen."):
+                yield function
+
+
+def annotated(public: Any) -> Iterator[tuple[str, Any]]:
+    """What is annotated in the signature of a function, or in the fields, methods and properties of a class."""
+    if inspect.isfunction(public):
+        yield from typing.get_type_hints(public, names_in(public.__module__)).items()
+    elif inspect.isclass(public):
+        for base in (each for each in public.__mro__ if each.__module__.startswith("cnpgen.")):
+            for name, hint in typing.get_type_hints(base, names_in(base.__module__)).items():
+                if not name.startswith("_"):
+                    yield name, hint
+            for function in functions_of(base):
+                for name, hint in annotated(function):
+                    yield f"{function.__name__}: {name}", hint
+
+
+def test_every_class_in_a_public_signature_is_public() -> None:
+    public = [getattr(cnpgen, name) for name in cnpgen.__all__]
+    known = {*public, *(getattr(cnpgen.plugins, name) for name in cnpgen.plugins.__all__)} - {cnpgen.__version__}
+    found = {
+        (kind, f"{owner.__name__}({where})")
+        for owner in public
+        if owner is not cnpgen.__version__
+        for where, hint in annotated(owner)
+        for kind in classes_in(hint)
+        if kind not in known
+    }
+    assert [f"{kind.__name__} in {where}" for kind, where in found if kind.__name__ not in INNER] == []
+    assert {kind.__name__ for kind, _ in found} == set(INNER), "what is listed here and found nowhere"
+
+
+def test_the_walk_sees_functions_fields_methods_and_properties() -> None:
+    found = {
+        kind
+        for owner in (cnpgen.load_plans, cnpgen.Plans, cnpgen.Motion, cnpgen.obstacle_tops)
+        for _, hint in annotated(owner)
+        for kind in classes_in(hint)
+    }
+    assert {cnpgen.Problem, cnpgen.ProblemRecord, cnpgen.Boundary, cnpgen.States, cnpgen.TrajectorySpec} <= found
+
+
+def test_the_stub_lists_every_name_once_and_nothing_else() -> None:
+    stub = Path(cnpgen.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    names = [line.split(" as ")[1] for line in stub.splitlines()]
+    assert sorted(names) == sorted(set(names)) == sorted(cnpgen.__all__)
+
+
+def test_importing_the_package_loads_none_of_its_rooms() -> None:
+    code = "import sys, cnpgen; print(*sorted(name for name in sys.modules if name.startswith(('cnpgen', 'numpy'))))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["cnpgen"]
