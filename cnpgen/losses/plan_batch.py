@@ -74,7 +74,11 @@ def check_batch(
         UsageError: A shape is wrong, the heights of the obstacles are missing, or something is no real number.
     """
     given = {"path": (path, dtype), "rate": (rate, dtype), "tops": (tops, dtype), "start_tip": (start_tip, "float64")}
-    found = {name: numbers(name, values, kind) for name, (values, kind) in given.items() if values is not None}
+    found = {
+        name: numbers(name, values, kind, differentiable=True)
+        for name, (values, kind) in given.items()
+        if values is not None
+    }
     check_shapes(problem, {name: array.shape for name, array in found.items()})
     good = np.asarray((found["rate"] > 0).all(axis=1))
     for array in found.values():

@@ -218,7 +218,7 @@ class PlanLoss:
         Raises:
             UsageError: The shape is wrong, a weight is negative or not finite, or there is no such term.
         """
-        given = numbers("weights", self.in_order(weights))
+        given = numbers("weights", self.in_order(weights), differentiable=True)
         self._check_count(given.shape)
         for name, weight in zip(self.terms[1:], given.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:

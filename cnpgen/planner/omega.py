@@ -106,7 +106,7 @@ class Omega:
         given = dict(vars(boundary))
         if given.pop("goal_ddq") is not None:
             raise UsageError("goal accelerations are left free, so goal_ddq must be None")
-        arrays = {name: numbers(name, values) for name, values in given.items()}
+        arrays = {name: numbers(name, values, differentiable=True) for name, values in given.items()}
         shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
         for name, array in arrays.items():
             if array.shape != shape:
@@ -201,7 +201,8 @@ class Omega:
                 raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
 
     def _before_landing(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
-        phi, log_rate = numbers("phi", phi), numbers("log_rate", log_rate)
+        phi = numbers("phi", phi, differentiable=True)
+        log_rate = numbers("log_rate", log_rate, differentiable=True)
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
             return control_points.control_points(tasks, phi, log_rate, scale=self._scale, spec=self.problem.trajectory)

@@ -50,20 +50,22 @@ def number(name: str, value: Any) -> float:
     return found
 
 
-def numbers(name: str, values: ArrayLike, dtype: str = "float64") -> Array:
+def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentiable: bool = False) -> Array:
     """Return an argument as an array of floats, nan and inf included; texts, dates and complex numbers are none.
 
     Args:
         name: The argument's name.
-        values: What was given: numbers, lists of them, arrays, or tensors on the CPU, whose gradients are left behind.
+        values: What was given: numbers, lists of them, arrays, or tensors on the CPU.
         dtype: "float64" or "float32".
+        differentiable: Whether a gradient must not be lost: tensors that carry one are then refused, else detached.
 
     Raises:
         UsageError: These are no real numbers, or rows of different lengths, or not in the memory of this process.
     """
     wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
     try:
-        array = np.asarray(values.detach() if hasattr(values, "detach") else values)  # torch asks for it
+        detached = values.detach() if hasattr(values, "detach") and not differentiable else values
+        array = np.asarray(detached)
         if array.dtype == dtype:
             return array
         with np.errstate(over="ignore"):

@@ -17,7 +17,7 @@ from cnpgen.problems.robot import load_robot
 WITHOUT_EFFECT = {
     "cnpgen.errors": "the words of exceptions",
     "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
-    "cnpgen.store.field": "how stored columns are described",
+    "cnpgen.store": "how columns are described and files are written",
 }
 MODULES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path

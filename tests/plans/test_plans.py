@@ -374,11 +374,11 @@ def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
 
 def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
     for name, content, message in (
-        ("text.h5", b"hello", "not an HDF5 file, or its beginning is damaged"),
-        ("empty.h5", b"", "not an HDF5 file, or its beginning is damaged"),
+        ("text.h5", b"hello", "not an HDF5 file.*: it seems to be a text file"),
+        ("empty.h5", b"", "not an HDF5 file.*: it is empty"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(DatasetError, match=rf"{name} is .*{message}|{name} {message}"):
+        with pytest.raises(DatasetError, match=rf"{name} is {message}"):
             load_plans(tmp_path / name)
     with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a file of plans"):
         load_plans(tmp_path / "none.h5")

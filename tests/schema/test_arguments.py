@@ -69,6 +69,22 @@ def test_what_is_no_array_of_numbers_is_refused_with_what_it_is(values: Any, why
         numbers("x", values)
 
 
+class Tensor:
+    """What NumPy makes of a tensor that carries a gradient: nothing, until it is detached."""
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise RuntimeError("it requires grad")
+
+    def detach(self) -> np.ndarray:
+        return np.array([1.0, 2.0])
+
+
+def test_a_gradient_is_left_behind_unless_it_must_not_be_lost() -> None:
+    assert numbers("x", Tensor()).tolist() == [1.0, 2.0]
+    with pytest.raises(UsageError, match="x must be an array of numbers, got Tensor: it requires grad"):
+        numbers("x", Tensor(), differentiable=True)
+
+
 def test_yes_and_no_are_booleans_and_nothing_else() -> None:
     assert flag("on", True) is flag("on", np.bool_(True)) is True
     for value in (1, "no", None, [True]):

@@ -180,7 +180,7 @@ def _real(name: str, values: Any, dtype: Any) -> jax.Array:
     Raises:
         UsageError: These are no real numbers.
     """
-    array = values if isinstance(values, jax.Array) else jnp.asarray(numbers(name, values))
+    array = values if isinstance(values, jax.Array) else jnp.asarray(numbers(name, values, differentiable=True))
     if jnp.iscomplexobj(array):
         raise UsageError(f"{name} must be real numbers, got {array.dtype}")
     return array.astype(dtype)

@@ -162,7 +162,7 @@ def _tensor(name: str, values: Any) -> torch.Tensor:
         UsageError: These are no real numbers.
     """
     if not isinstance(values, torch.Tensor):
-        return torch.tensor(numbers(name, values))
+        return torch.tensor(numbers(name, values, differentiable=True))
     if values.is_complex():
         raise UsageError(f"{name} must be real numbers, got {values.dtype}")
     return values
