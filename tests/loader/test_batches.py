@@ -309,7 +309,7 @@ def test_arguments_that_cannot_be_meant_are_refused(plain: Dataset, options: dic
 
 def test_unknown_splits_and_fields_are_refused_with_the_nearest_name(plain: Dataset) -> None:
     with pytest.raises(
-        DatasetError, match=r"no split 'valid' \(did you mean 'validation'\?\), only train, validation$"
+        DatasetError, match=r"no split 'valid' \(did you mean 'validation'\?\), only train, validation, test$"
     ):
         plain.batches(8, split="valid")
     with pytest.raises(DatasetError, match=r"no field 'start_dq'.*did you mean 'start_q'"):
