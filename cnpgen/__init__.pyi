@@ -25,6 +25,7 @@ from cnpgen.losses.metric_settings import suggested_weights as suggested_weights
 from cnpgen.losses.plan_loss import LossValue as LossValue
 from cnpgen.losses.plan_loss import PlanLoss as PlanLoss
 from cnpgen.losses.quadrature import rotating_shift as rotating_shift
+from cnpgen.machine.times import Times as Times
 from cnpgen.machine.versions import __version__ as __version__
 from cnpgen.make.boundary_problems import draw_boundary_problems as draw_boundary_problems
 from cnpgen.make.dataset import MadeDataset as MadeDataset

@@ -131,7 +131,7 @@ def agreed_problem(
     """
     found = stored or wanted
     if found is None:
-        help_ = f"set its attribute 'problem' to a name or a file, or pass problem=... (--problem of {command!r})"
+        help_ = f"set its attribute 'problem' to a name or a file, or pass problem= ('cnpgen {command}' takes it)"
         raise DatasetError(f"{path} does not say its problem: {help_}")
     if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
         where = ", ".join(found.differences(wanted)[:4])

@@ -236,8 +236,8 @@ def test_a_place_where_no_folder_can_be_is_one_line_with_what_to_do(tmp_path, ca
     (tmp_path / "file").write_text("mine")
     expected = {
         "": (2, "out must name a folder, got ''"),
-        str(tmp_path / "file"): (2, "file is a file, not a folder; choose another out="),
-        str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another out="),
+        str(tmp_path / "file"): (2, "file is a file, not a folder; choose another --out"),
+        str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another --out"),
         str(tmp_path / ("x" * 300)): (3, "File name too long; choose a shorter name"),
     }
     for out, (code, text) in expected.items():

@@ -65,14 +65,14 @@ def test_what_is_left_out_is_zero_and_goal_accelerations_are_kept_where_they_are
 
 def test_a_file_may_say_its_problem_itself(write) -> None:
     assert load_boundary_problems(write(attributes={"problem": "airhockey"})).problem == RECORD
-    texts = {"problem_recipe": RECORD.recipe, "problem_urdf": RECORD.urdf, "problem_sha256": RECORD.digest}
+    texts = {"problem_recipe": RECORD.recipe, "problem_urdf": RECORD.urdf, "problem_sha256": RECORD.comparable_sha256}
     assert load_boundary_problems(write(attributes=texts)).problem == RECORD
 
 
 def test_a_shard_is_of_the_problem_of_its_dataset_and_needs_one_without_it(tiny: Tiny, tmp_path: Path, rows) -> None:
     shard = tiny("airhockey-replan") / "train" / "shard-00000.h5"
     found = load_boundary_problems(shard)
-    assert found.problem.digest == RECORD.digest
+    assert found.problem.comparable_sha256 == RECORD.comparable_sha256
     np.testing.assert_array_equal(found.boundary.start_ddq[:3], rows.boundary.start_ddq)
     with pytest.raises(DatasetError, match="boundary problems of problem 'airhockey', not of 'heavy-object'"):
         load_boundary_problems(shard, problem="heavy-object")

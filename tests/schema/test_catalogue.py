@@ -362,7 +362,7 @@ def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
     [
         ("rol", r"unknown pipeline 'rol' \(did you mean 'roll'\?\); known: roll"),
         ("", "unknown pipeline ''; known: roll"),
-        ("arm", "unknown pipeline 'arm', which is a problem; known: roll"),
+        ("arm", "unknown pipeline 'arm': it is the name of a problem; known: roll"),
         ("roll-1k", "unknown pipeline 'roll-1k': it is the name of a dataset; known: roll"),
         ("rolll.toml", r"no such file: rolll.toml \(did you mean 'roll'\?\)"),
         ("some/roll", "no such file: some/roll"),
@@ -387,7 +387,7 @@ def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path
         (
             load_dataset_recipe,
             "airhockey",
-            "dataset or pipeline 'airhockey': it is the name of a problem; ",
+            "unknown dataset or pipeline 'airhockey': it is the name of a problem",
         ),
     ],
 )

@@ -42,7 +42,7 @@ def test_a_dataset_whose_blueprint_is_damaged_is_a_dataset_still(tmp_path: Path)
     found = find_workspace(tmp_path)
     assert (found.holds, found.rows, found.blueprint) == ("a dataset", True, None)
     assert "plan.json is damaged" in found.damage
-    with pytest.raises(DatasetError, match=r"damaged.*--force replaces"):
+    with pytest.raises(DatasetError, match=r"damaged.*force=True replaces"):
         begun_blueprint(found, BLUEPRINT)
     assert check_clearable(found) == [tmp_path / "train"]
 

@@ -80,7 +80,6 @@ def test_what_was_made_is_valid_to_the_last_row_and_made_again_to_the_bit(tiny: 
     assert all(np.isfinite(check.worst) for check in report.deep.checks)
 
 
-@pytest.mark.slow
 def test_thousands_of_float32_rows_are_valid(tmp_path):
     for name in SHIPPED:
         make_dataset(name, tmp_path / name, n=4000, workers=1, dtype="float32")
