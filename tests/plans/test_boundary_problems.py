@@ -77,7 +77,7 @@ def test_a_shard_is_of_the_problem_of_its_dataset_and_needs_one_without_it(tiny:
     with pytest.raises(DatasetError, match="boundary problems of problem 'airhockey', not of 'heavy-object'"):
         load_boundary_problems(shard, problem="heavy-object")
     alone = shutil.copy(shard, tmp_path / "alone.h5")
-    with pytest.raises(DatasetError, match=r"does not say its problem: .*--problem of 'solve'"):
+    with pytest.raises(DatasetError, match=r"does not say its problem: .*'cnpgen solve' takes it"):
         load_boundary_problems(alone)
     assert len(load_boundary_problems(alone, problem="airhockey")) == len(found)
 
