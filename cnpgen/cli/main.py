@@ -110,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the boundary of the process
             if "--debug" in words:
                 traceback.print_exc()
-            return _report(error, vars(given))
+            return _report(error, vars(given), words)
     return code
 
 
@@ -145,7 +145,7 @@ def build_parser() -> Parser:
     return parser
 
 
-def _report(error: BaseException, options: Container[str]) -> int:
+def _report(error: BaseException, options: Container[str], words: Sequence[str]) -> int:
     """Print an error as one line per mistake, in the words of the command's options; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
         what = "terminated" if isinstance(error, Terminated) else "interrupted"
@@ -153,7 +153,7 @@ def _report(error: BaseException, options: Container[str]) -> int:
         return exit_code(error)
     lines, code = _explain(error)
     for line in lines:
-        print(f"cnpgen: error: {in_shell(line, options)}", file=sys.stderr)
+        print(f"cnpgen: error: {in_shell(line, options, words)}", file=sys.stderr)
     return code
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cnpgen.loader.columns import Columns
+from cnpgen.loader.normalization import Normalization
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +21,13 @@ class Batch(Mapping[str, NDArray[Any]]):
         table: The fields of numbers side by side, C-contiguous, shape (B, D).
         layout: Which fields there are and where.
         integers: The fields of integers, int64, shape (B, width) or (B,).
+        normalization: What the fields of numbers were normalised with; None if they are in their units.
     """
 
     table: NDArray[Any]
     layout: Columns
     integers: Mapping[str, NDArray[Any]]
+    normalization: Normalization | None = None
 
     def __repr__(self) -> str:
         return f"<batch of {self.rows} rows, {self.table.dtype}: {self.layout.summary}>"

@@ -70,9 +70,9 @@ class Windows:
             tables.append(packed.table.take(rows, axis=0))
             integers.append({name: values.take(rows, axis=0) for name, values in packed.integers.items()})
         if len(tables) == 1:
-            return Batch(tables[0], self._form.layout, integers[0])
+            return Batch(tables[0], self._form.layout, integers[0], self._form.normalization)
         joined = {name: np.concatenate([part[name] for part in integers]) for name in integers[0]}
-        return Batch(np.concatenate(tables), self._form.layout, joined)
+        return Batch(np.concatenate(tables), self._form.layout, joined, self._form.normalization)
 
     def _pieces(self, first: int, last: int, step: int) -> Iterator[Loaded]:
         """Give the positions ``range(first, last, step)`` window by window: the window and numbers of rows in it."""

@@ -53,9 +53,9 @@ def signals_taken(first: Told, again: Told, *, stay: bool = False) -> Iterator[R
         elif time.monotonic() - received.since > ECHO_SECONDS:
             again(number)
 
-    for number in before:
-        signal.signal(number, take)
     try:
+        for number in before:
+            signal.signal(number, take)
         yield received
     finally:
         if not (stay and received.came):

@@ -1,4 +1,4 @@
-"""Where the time of a run went: into compiling kernels, which is done once, into computing, and into waiting."""
+"""Where the time of a run went: into preparing (compiling kernels, if they are not cached), computing and waiting."""
 
 import time
 from dataclasses import asdict, dataclass, field
@@ -9,23 +9,23 @@ class Times:
     """The time that has passed in a run, in parts [s].
 
     Attributes:
-        compiling: Until everything was prepared: above all kernels are compiled, unless they are in the cache.
+        preparing: Until everything was prepared: above all kernels are compiled, unless they are in the cache.
         computing: CPU time after that, of each of the processes that share the work.
         waiting: The rest: for the processor where other jobs use it, for the disk, or for the last process.
     """
 
-    compiling: float = 0.0
+    preparing: float = 0.0
     computing: float = 0.0
     waiting: float = 0.0
 
     @property
     def passed(self) -> float:
         """All of it [s]."""
-        return self.compiling + self.computing + self.waiting
+        return self.preparing + self.computing + self.waiting
 
     def __str__(self) -> str:
         return (
-            f"{self.passed:.1f} s ({self.compiling:.1f} s compiling, {self.computing:.1f} s computing,"
+            f"{self.passed:.1f} s ({self.preparing:.1f} s preparing and compiling, {self.computing:.1f} s computing,"
             f" {self.waiting:.1f} s waiting)"
         )
 
@@ -43,18 +43,18 @@ class Stopwatch:
 
     Attributes:
         begun: When that was [s].
-        compiling: How long everything took to prepare [s].
+        preparing: How long everything took to prepare [s].
         computing: CPU time of each process since then [s]; whoever computes in other processes adds to it.
     """
 
     begun: float = field(default_factory=time.perf_counter)
-    compiling: float = 0.0
+    preparing: float = 0.0
     computing: float = 0.0
     _cpu: float = 0.0
 
     def prepared(self) -> None:
         """Note that everything is prepared."""
-        self.compiling, self._cpu = time.perf_counter() - self.begun, time.process_time()
+        self.preparing, self._cpu = time.perf_counter() - self.begun, time.process_time()
 
     def computed_here(self) -> None:
         """Note that this process has computed since all was prepared, and no other one."""
@@ -62,5 +62,5 @@ class Stopwatch:
 
     def times(self) -> Times:
         """Say where the time went until now."""
-        left = time.perf_counter() - self.begun - self.compiling
-        return Times(self.compiling, self.computing, max(left - self.computing, 0.0))
+        left = time.perf_counter() - self.begun - self.preparing
+        return Times(self.preparing, self.computing, max(left - self.computing, 0.0))

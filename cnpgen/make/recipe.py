@@ -77,7 +77,7 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
         sha256, as 64 hexadecimal digits.
     """
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
-    return resolved_digest(resolved(pipeline), pipeline.problem.urdf_path.read_bytes())
+    return resolved_digest(resolved(pipeline), pipeline.problem.urdf_text.encode())
 
 
 def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:

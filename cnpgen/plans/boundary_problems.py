@@ -58,7 +58,7 @@ def load_boundary_problems(
         RecipeError: ``problem`` has mistakes.
     """
     path = Path(path)
-    if path.is_file() or path.suffix == ".h5":
+    if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):
         if (split, start, n) != (None, None, None):
             raise UsageError(f"split, start and n choose rows of the folder of a dataset, {path} is a file")
         return _of_file(path, None if problem is None else as_record(problem))

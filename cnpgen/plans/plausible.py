@@ -1,5 +1,6 @@
 """Joint positions that cannot be meant: in degrees, or normalised."""
 
+import inspect
 import warnings
 
 import numpy as np
@@ -10,7 +11,7 @@ from cnpgen.trajectory.boundary import Boundary
 FAR = 2.0  # from the middle of a joint's range, in halves of it: a whole half range beyond its limit
 
 
-def warn_of_far_joints(robot: Robot, boundary: Boundary, *, stacklevel: int = 3) -> None:
+def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
     """Warn where a start or a goal is so far outside of the joints' limits that its unit is probably another one.
 
     It is no error: boundary conditions are not judged where they come in, files may hold anything, and the verdict says
@@ -19,7 +20,6 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary, *, stacklevel: int = 3)
     Args:
         robot: The robot.
         boundary: Boundary conditions, shape (N, n) each.
-        stacklevel: Whose line of code the warning names, as of ``warnings.warn``.
     """
     low, high = robot.position_lower, robot.position_upper
     for name in ("start_q", "goal_q"):
@@ -32,5 +32,13 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary, *, stacklevel: int = 3)
                 f"{name} of plan {plan}: {robot.joint_names[joint]} = {value} is far outside of its limits, {limits}:"
                 " joint positions must be in rad, are these degrees, or normalised?",
                 UserWarning,
-                stacklevel=stacklevel,
+                stacklevel=_users_level(),
             )
+
+
+def _users_level() -> int:
+    """Return the ``stacklevel`` of a warning of this module's that names the user's line, not one of this package."""
+    level, frame = 0, inspect.currentframe()
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in {"cnpgen", "contextlib"}:
+        level, frame = level + 1, frame.f_back
+    return max(level, 1)

@@ -73,7 +73,8 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
     except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
         uneven = "inhomogeneous" in str(error)
         raise UsageError(f"{wrong}: {'its rows have different lengths' if uneven else error}") from error
-    if array.dtype.kind in "cUSmM":  # NumPy would drop an imaginary part, and read texts
+    missing = array.dtype.kind == "O" and any(value is None for value in array.flat)
+    if array.dtype.kind in "cUSmM" or missing:  # NumPy would drop imaginary parts, and read texts and None
         raise UsageError(f"{wrong}: {array.dtype} is no real type")
     return real
 

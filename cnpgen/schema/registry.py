@@ -134,11 +134,14 @@ def source_digest(kind: type) -> str:
 
 def package_digest(package: str) -> str:
     """Hash the source files of an imported top-level package or module; empty if it has none."""
-    source = getattr(sys.modules.get(package), "__file__", None)
-    if not source:
+    module = sys.modules.get(package)
+    folders = [Path(folder) for folder in getattr(module, "__path__", ())]  # more than one of a namespace package
+    source = getattr(module, "__file__", None)
+    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    if not folders and source:
+        files = [Path(source)]
+    if not files:
         return ""
-    path = Path(source)
-    files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 

@@ -31,6 +31,12 @@ class Field:
     valid_max: tuple[float, ...] | None = None
     dtype: str = "float"
 
+    def __post_init__(self) -> None:
+        for name in ("valid_min", "valid_max"):  # floats, as they are read back: a blueprint's fingerprint has them
+            limits = getattr(self, name)
+            if limits is not None:
+                object.__setattr__(self, name, tuple(map(float, limits)))
+
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns in a table of several fields: ``"start_q.joint_1"``, or ``"hit_speed"`` of a scalar."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,15 @@ class Scaling(Protocol):
     def denormalize(self, rows: Mapping[str, Any]) -> Mapping[str, Any]:
         """Bring rows back into their units."""
         ...
+
+
+class Unsaid(Enum):
+    """An argument that was not given, where None means something."""
+
+    UNSAID = "not said"
+
+
+UNSAID = Unsaid.UNSAID
 
 
 @dataclass(frozen=True)
@@ -43,23 +53,27 @@ class Boundary:
     goal_ddq: Array | None = None
 
     @classmethod
-    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | None) -> "Boundary":
-        """Take the boundary conditions out of a batch of rows, whatever else is in it.
+    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | Unsaid | None = UNSAID) -> "Boundary":
+        """Take the boundary conditions out of a batch of rows, in their units, whatever else is in it.
 
         Args:
             batch: Field name -> values, shape (N, n): a batch, rows, or any mapping; arrays, or tensors.
-            normalization: What the rows were normalised with, ``dataset.normalization`` for batches, which are by
-                default; None for rows in their units.
+            normalization: What the rows were normalised with; None for rows in their units. Batches of a dataset know
+                it themselves, of other mappings it must be said.
 
         Raises:
-            UsageError: A boundary condition is not among the fields.
+            UsageError: A boundary condition is not among the fields, or it is not known how they were normalised.
         """
+        scaling = getattr(batch, "normalization", UNSAID) if normalization is UNSAID else normalization
+        if isinstance(scaling, Unsaid):
+            kind = type(batch).__name__
+            raise UsageError(f"normalization= must be said of a {kind}: dataset.normalization, or None for SI units")
         names = [each.name for each in fields(cls)]
         missing = [name for name in names if name not in batch and name != "goal_ddq"]
         if missing:
             raise UsageError(f"the batch lacks {', '.join(missing)}: it has the fields {', '.join(map(str, batch))}")
         rows = {name: batch[name] for name in names if name in batch}
-        return cls(**(rows if normalization is None else normalization.denormalize(rows)))
+        return cls(**(rows if scaling is None else scaling.denormalize(rows)))
 
     def __repr__(self) -> str:
         return f"<Boundary of shape {np.shape(self.start_q)}>"

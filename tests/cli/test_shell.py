@@ -25,10 +25,16 @@ OPTIONS = ("force", "workers", "learning_rate", "other_rows", "out", "problem")
         ("allow_incomplete=True does without", "allow_incomplete=True does without"),  # this command has no such option
         ("DatasetRecipe(problem='x', out=[1])", "DatasetRecipe(problem='x', out=[1])"),
         ("OMP_workers=3, problem=a.toml", "OMP_workers=3, problem=a.toml"),
+        ("/data/workers=3 and runs/workers=3/set are there", "/data/workers=3 and runs/workers=3/set are there"),
     ],
 )
 def test_arguments_that_the_command_has_are_told_as_options(text: str, said: str) -> None:
     assert in_shell(text, OPTIONS) == said
+
+
+def test_what_was_typed_is_repeated_as_it_was() -> None:
+    text = "workers=3 is not empty: choose another out="
+    assert in_shell(text, OPTIONS, ["-o", "workers=3"]) == "workers=3 is not empty: choose another --out"
 
 
 def test_python_and_the_shell_are_told_the_same_in_their_own_words(

@@ -1,4 +1,4 @@
-"""Times: what was compiling, computing and waiting, and together all that has passed."""
+"""Times: what was preparing, computing and waiting, and together all that has passed."""
 
 import time
 
@@ -23,7 +23,7 @@ def test_what_passes_is_compiling_computing_or_waiting() -> None:
     watch.computed_here()
     times = watch.times()
     passed = time.perf_counter() - begun
-    assert times.compiling >= 0.1
+    assert times.preparing >= 0.1
     assert 0.1 <= times.computing < 0.2
     assert times.waiting >= 0.2
     assert times.passed == pytest.approx(passed, abs=0.05)
@@ -39,7 +39,7 @@ def test_processes_that_share_the_work_compute_side_by_side() -> None:
 
 
 def test_times_are_said_in_words_and_in_json() -> None:
-    times = Times(compiling=170.12345, computing=7.6, waiting=0.5)
-    assert str(times) == "178.2 s (170.1 s compiling, 7.6 s computing, 0.5 s waiting)"
-    assert times.rounded() == {"compiling": 170.123, "computing": 7.6, "waiting": 0.5}
+    times = Times(preparing=170.12345, computing=7.6, waiting=0.5)
+    assert str(times) == "178.2 s (170.1 s preparing and compiling, 7.6 s computing, 0.5 s waiting)"
+    assert times.rounded() == {"preparing": 170.123, "computing": 7.6, "waiting": 0.5}
     assert NO_TIME.passed == 0.0

@@ -146,7 +146,7 @@ def test_plans_of_a_shuffled_batch_meet_and_name_the_rows_of_the_dataset(tiny: A
     rows = dataset.arrays("train", fields=[*BOUNDARY, "sample_id"])
     omega = omegas["airhockey"]
     batch = next(iter(dataset.batches(8, fields=[*BOUNDARY, "hit_speed", "sample_id"], dtype="float64")))
-    boundary = Boundary.from_batch(batch, dataset.normalization)
+    boundary = Boundary.from_batch(batch)
     tasks = omega.tasks(boundary)
     phi, log_rate = np.zeros((8, omega.path_outputs)), np.zeros((8, omega.rate_outputs))
     plans = omega.plans(tasks, phi, log_rate, sample_id=batch["sample_id"])
@@ -158,7 +158,12 @@ def test_plans_of_a_shuffled_batch_meet_and_name_the_rows_of_the_dataset(tiny: A
 
 
 def test_boundary_conditions_are_taken_out_of_rows_in_their_units(tiny: Any) -> None:
-    rows = cnpgen.load_dataset(tiny("airhockey-replan")).arrays("train")
+    dataset = cnpgen.load_dataset(tiny("airhockey-replan"))
+    rows = dataset.arrays("train")
+    with pytest.raises(UsageError, match=r"normalization= must be said of a dict: dataset\.normalization, or None"):
+        Boundary.from_batch(rows)
+    plain = next(iter(dataset.batches(8, shuffle=False, normalize=False, dtype="float64")))
+    np.testing.assert_array_equal(Boundary.from_batch(plain).start_q, rows["start_q"][:8])
     boundary = Boundary.from_batch(rows, None)
     assert boundary.goal_ddq is None
     np.testing.assert_array_equal(boundary.start_ddq, rows["start_ddq"])

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -204,5 +205,6 @@ def test_plans_are_the_same_on_every_backend(planner, rows, backend):
 def test_joint_positions_in_degrees_are_said_to_be_suspicious(planner, rows):
     with pytest.warns(
         UserWarning, match="start_q of plan 0: joint_2 = 40 rad is far outside of its limits, .* degrees"
-    ):
+    ) as told:
         planner.plan(np.array([0, 40.0, 0, -30, 0, 110]), rows.goal_q[0])
+    assert {Path(each.filename).name for each in told} == {"test_planner.py"}  # the line of whoever asked

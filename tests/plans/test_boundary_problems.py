@@ -161,3 +161,8 @@ def test_options_of_solve_that_mean_nothing_for_what_is_given_are_refused(
     assert main(["solve", *words]) in {1, 2}
     assert f"cnpgen: error: {line}" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.h5", "tasks.h5"]
+
+
+def test_the_folder_of_a_dataset_may_be_called_as_a_file(tiny: Callable[[str], Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "hits.h5"))
+    assert len(load_boundary_problems(folder, split="validation", n=3)) == 3

@@ -227,6 +227,12 @@ def test_a_value_that_is_no_number_anywhere_depends_on_nothing(benches):
     bound = np.zeros(1)
     lost = Condition("lost", "m", [np.nan], bound, bound, "position")
     assert measured_needs([lambda _: (lost,), lambda w: (replace(lost, g=[w.ddq[0]]),)], world) == [0, 2]
+    swallowed = [
+        lambda w: (replace(lost, g=[np.nan_to_num(w.dq[1])]),),
+        lambda w: (replace(lost, g=[float(np.where(np.abs(w.ddq[0]) > 1.5 * w.robot.acceleration_limit[0], 1, 0))]),),
+        lambda w: (replace(lost, g=[np.fmax(w.q[0], 0.0)]),),
+    ]
+    assert measured_needs(swallowed, world) == [1, 2, 0]
 
 
 # --- met and violated -------------------------------------------------------------------------------------------------

@@ -292,7 +292,8 @@ def test_solve_and_refine_write_files_that_evaluate_calls_valid(
     told = capsys.readouterr()
     assert told.out.strip() == str(out)
     assert re.search(
-        r"3 plans valid in [\d.]+ s \([\d.]+ s compiling, [\d.]+ s computing, [\d.]+ s waiting\);", told.err
+        r"3 plans valid in [\d.]+ s \([\d.]+ s preparing and compiling, [\d.]+ s computing, [\d.]+ s waiting\);",
+        told.err,
     )
     assert main(["refine", str(out), "--json", "--quiet"]) == 0
     said = json.loads(capsys.readouterr().out)

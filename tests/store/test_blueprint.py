@@ -21,6 +21,7 @@ from cnpgen.store.blueprint import (
     to_json,
     write_blueprint,
 )
+from cnpgen.store.field import Field
 from cnpgen.store.files.documents import save_document
 from tests.examples.store import BLUEPRINT
 
@@ -30,6 +31,13 @@ def test_a_blueprint_survives_json_disk_and_pickle(tmp_path: Path) -> None:
     assert load_blueprint(tmp_path) == BLUEPRINT
     assert from_json(json.loads(json.dumps(to_json(BLUEPRINT)))) == BLUEPRINT
     assert pickle.loads(pickle.dumps(BLUEPRINT)).fingerprint == BLUEPRINT.fingerprint
+
+
+def test_limits_that_are_integers_in_python_are_the_same_after_reading(tmp_path: Path) -> None:
+    field = Field("count", "1", "a number", valid_min=(0,), valid_max=(3,))
+    blueprint = replace(BLUEPRINT, fields=(*BLUEPRINT.fields, field))
+    write_blueprint(tmp_path, blueprint)
+    assert load_blueprint(tmp_path) == blueprint
 
 
 def test_the_seed_is_stored_as_text_because_json_numbers_of_other_readers_have_53_bits() -> None:

@@ -10,6 +10,7 @@ from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.columns import Columns
+from cnpgen.loader.normalization import Normalization
 
 MOST_WORKERS = 1024
 
@@ -21,17 +22,25 @@ class TensorBatch(dict[str, torch.Tensor]):
         table: The fields of numbers side by side, shape (B, D).
         layout: Which fields there are and where.
         integers: The fields of integers, shape (B, width) or (B,).
+        normalization: What the fields of numbers were normalised with; None if they are in their units.
 
     Attributes:
         table: The packed table: what a network that wants everything side by side takes.
         layout: Which fields there are and where.
+        normalization: As it was given.
     """
 
-    def __init__(self, table: torch.Tensor, layout: Columns, integers: Mapping[str, torch.Tensor]) -> None:
+    def __init__(
+        self,
+        table: torch.Tensor,
+        layout: Columns,
+        integers: Mapping[str, torch.Tensor],
+        normalization: Normalization | None = None,
+    ) -> None:
         parts = {name: part.start if name in layout.scalars else part for name, part in layout.slices.items()}
         names = (field.name for field in layout.fields)
         super().__init__({name: table[:, parts[name]] if name in parts else integers[name] for name in names})
-        self.table, self.layout = table, layout
+        self.table, self.layout, self.normalization = table, layout, normalization
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -42,7 +51,7 @@ class TensorBatch(dict[str, torch.Tensor]):
         """Bring a batch to a device: the table in one transfer, and views of it there."""
         there = {"device": device, "non_blocking": non_blocking}
         integers = {field.name: self[field.name].to(**there) for field in self.layout.integers}
-        return TensorBatch(self.table.to(**there), self.layout, integers)
+        return TensorBatch(self.table.to(**there), self.layout, integers, self.normalization)
 
     def update(self, *fields: Any, **more: torch.Tensor) -> None:
         """Replace fields by others of the same shape: a batch has the rows of its table.
@@ -68,7 +77,7 @@ class TensorBatch(dict[str, torch.Tensor]):
 def to_torch(batch: Batch) -> TensorBatch:
     """Give a batch as tensors on its own memory."""
     integers = {name: torch.from_numpy(values) for name, values in batch.integers.items()}
-    return TensorBatch(torch.from_numpy(batch.table), batch.layout, integers)
+    return TensorBatch(torch.from_numpy(batch.table), batch.layout, integers, batch.normalization)
 
 
 class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]

@@ -3,15 +3,21 @@
 0 is a condition on positions, 1 one on velocities, too, 2 one on accelerations.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition
 
 if TYPE_CHECKING:
     from cnpgen.world.state import World
+
+Array = NDArray[np.float64]
+
+_SHARES = (0.1, 0.9, 10.0)  # of the limits
+_MIXED = np.cos(np.arange(64.0))  # joints move to both sides, none at the speed of another
 
 
 def symbolic_needs(condition: Condition, dq: Any, ddq: Any) -> int:
@@ -29,16 +35,37 @@ def symbolic_needs(condition: Condition, dq: Any, ddq: Any) -> int:
 
 
 def measured_needs(forms: "Iterable[Callable[[World], Iterable[Condition]]]", world: "World") -> list[int]:
-    """Say what conditions in measured form depend on, in their order: where dq is not a number, g is none, either.
+    """Say what conditions in measured form depend on, in their order: what changes where dq or ddq does.
+
+    They are asked where dq or ddq is not a number and, as a form may swallow that, where it is far below its limit,
+    near it, and far above.
 
     Args:
         forms: What evaluates them: ``measured`` of every constraint, or ``measured_at`` for an end.
         world: Where they are evaluated; it is left at rest in the base configuration.
     """
-    n, tops = world.robot.n, np.zeros(len(world.obstacles))
-    zero, unknown = np.zeros(n), np.full(n, np.nan)
-    forms, lost = list(forms), []
-    for dq, ddq in ((zero, unknown), (unknown, zero), (zero, zero)):
+    robot, forms = world.robot, list(forms)
+    rest = np.zeros(robot.n)
+    velocities = [rest + np.nan, *(share * robot.velocity_limit * _MIXED[: robot.n] for share in _SHARES)]
+    accelerations = [rest + np.nan, *(share * robot.acceleration_limit * _MIXED[: robot.n] for share in _SHARES)]
+    by_ddq = _changed(forms, world, [(rest, ddq) for ddq in accelerations])
+    by_dq = _changed(forms, world, [(dq, rest) for dq in velocities])
+    return [2 if second else 1 if first else 0 for first, second in zip(by_dq, by_ddq, strict=True)]
+
+
+def _changed(
+    forms: "Sequence[Callable[[World], Iterable[Condition]]]", world: "World", states: Iterable[tuple[Array, Array]]
+) -> list[bool]:
+    """Say which conditions have another value at one of the states than at rest; the world is left at rest."""
+    tops, rest = np.zeros(len(world.obstacles)), np.zeros(world.robot.n)
+
+    def values(dq: Array, ddq: Array) -> list[Array]:
         world.set_state(world.robot.base, dq, ddq, tops)
-        lost.append([int(np.isnan(np.array(each.g, float)).sum()) for form in forms for each in form(world)])
-    return [2 if by_ddq > known else 1 if by_dq > known else 0 for by_ddq, by_dq, known in zip(*lost, strict=True)]
+        return [np.array(each.g, float) for form in forms for each in form(world)]
+
+    moving = [values(*state) for state in states]
+    still = values(rest, rest)
+    return [
+        any(not np.array_equal(one[index], known, equal_nan=True) for one in moving)
+        for index, known in enumerate(still)
+    ]
