@@ -151,7 +151,7 @@ def _write(
     columns: Mapping[str, NDArray[Any]],
     about: Mapping[str, Any],
 ) -> ShardRecord:
-    """Write a shard and then its sidecar, which holds what is said about how the shard came about."""
+    """Write a shard and then its sidecar, which says how the shard came about, unless somebody else has meanwhile."""
     path = folder / task.file
     size = write_shard(
         path, columns, blueprint.fields, shard_attributes(blueprint, task), dtype=blueprint.dtype, work=folder / WORK
@@ -166,6 +166,8 @@ def _write(
         statistics=column_statistics(columns, blueprint.fields),
         **about,
     )
+    if is_committed(folder, task, blueprint.fingerprint):  # meanwhile, by somebody who may have summed up their record
+        return load_record(folder, task)
     save_record(folder, task, record)
     return record
 

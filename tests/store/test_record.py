@@ -78,7 +78,9 @@ def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> Non
     assert not list(tmp_path.rglob("*"))
 
 
-@pytest.mark.parametrize("flush", [0, 2], ids=["the shard is flushed", "its record is flushed"])
+@pytest.mark.parametrize(
+    "flush", [0, 1, 2], ids=["the shard is flushed", "its folder is flushed", "its record is flushed"]
+)
 def test_a_run_that_finishes_the_dataset_does_not_stop_another_one_in_the_middle_of_a_shard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flush: int
 ) -> None:
@@ -93,7 +95,8 @@ def test_a_run_that_finishes_the_dataset_does_not_stop_another_one_in_the_middle
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", meanwhile)
-        record = make_shard(tmp_path, BLUEPRINT, TASK)
+        columns, fates = make_columns(TASK), make_fates(TASK)
+        record = commit_shard(tmp_path, BLUEPRINT, TASK, columns=columns, fates=fates, seconds=9.0)  # slower than they
     assert record.sha256 == file_sha256(tmp_path / TASK.file)
     assert not list(tmp_path.rglob("*.tmp"))
     assert check_dataset(tmp_path) == []
