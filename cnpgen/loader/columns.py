@@ -63,9 +63,9 @@ def select_columns(blueprint: Blueprint, names: Iterable[str] | None) -> Columns
     """Look fields up by name.
 
     Args:
-        blueprint: The dataset's plan.
+        blueprint: The dataset's blueprint.
         names: Names in the order they are wanted in; by default all fields of numbers that are not diagnostics, in
-            the plan's order.
+            the blueprint's order.
 
     Raises:
         DatasetError: There is no such field.

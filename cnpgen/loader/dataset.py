@@ -34,7 +34,7 @@ class Dataset:
 
     Attributes:
         folder: Its folder.
-        blueprint: Its plan: recipe, seed, robot, versions.
+        blueprint: Its blueprint: recipe, seed, robot, versions.
         fingerprint: Fingerprint of the rows that are there; equal fingerprints, equal rows.
         shards: Split -> its shards that are there.
         statistics: Split -> field -> statistics of its columns, in the field's unit.

@@ -53,7 +53,7 @@ def make_form(
     """Settle what is delivered.
 
     Args:
-        blueprint: The dataset's plan.
+        blueprint: The dataset's blueprint.
         own: The dataset's own normalisation, if it has training rows.
         fields: Names of the fields; by default all fields of numbers that are not diagnostics.
         normalize: Whether to normalise, or what with instead of the dataset's own.

@@ -11,7 +11,7 @@ from cnpgen.schema.arguments import flag
 from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.files.documents import load_document
 from cnpgen.store.intact import AGAIN
-from cnpgen.store.layout import STATS
+from cnpgen.store.layout import PLAN, STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.statistics import FieldStatistics, statistics_from_json
@@ -87,7 +87,7 @@ def _load_statistics(folder: Path, blueprint: Blueprint) -> Statistics:
     path = folder / STATS
     document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION)
     if document["plan_fingerprint"] != blueprint.fingerprint:
-        raise DatasetError(f"{path} is of another plan than plan.json; {AGAIN}")
+        raise DatasetError(f"{path} is of another blueprint than {PLAN}; {AGAIN}")
     return {
         split: {name: statistics_from_json(content) for name, content in fields.items()}
         for split, fields in document["splits"].items()

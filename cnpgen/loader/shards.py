@@ -14,6 +14,7 @@ from cnpgen.loader.columns import tail
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import AGAIN, digest_problem, size_problem
+from cnpgen.store.layout import PLAN
 from cnpgen.store.shard import Placement, read_attributes, read_placements, read_shard
 
 MOST_MAPS = 32  # that are kept; each holds a file descriptor, and pages that the system may take back at any time
@@ -29,7 +30,7 @@ class Shard:
         first_row: Index of its first row within the split, as it was planned.
         size: Size of the file [bytes].
         sha256: Its digest.
-        key: The plan's key, which the file repeats.
+        key: The blueprint's key, which the file repeats.
     """
 
     path: Path
@@ -73,7 +74,7 @@ class ShardReader:
             Field name -> values as stored, shape (rows, width) or (rows,), not writeable where mapped.
 
         Raises:
-            DatasetError: The shard is missing, damaged, of another plan or lacks a field.
+            DatasetError: The shard is missing, damaged, of another blueprint or lacks a field.
             MachineError: The system would not let us read it.
         """
         if problem := shard.problem():  # to touch a map that reaches beyond its file would end the process
@@ -119,12 +120,12 @@ def _mapped(shard: Shard) -> mmap.mmap | None:
 
 
 def _check_field(shard: Shard, field: Field, found: Placement | None) -> None:
-    """Refuse a shard whose header does not say what the plan says of a field."""
+    """Refuse a shard whose header does not say what the blueprint says of a field."""
     shape = (shard.rows, *tail(field))
     kind = "f" if field.dtype == "float" else "i"
     if found is None or found.shape != shape or found.dtype.kind != kind:
         text = "is missing" if found is None else f"is {found.dtype} of shape {found.shape}"
-        raise DatasetError(f"{shard.path}: field {field.name!r} {text}; the plan says {field.dtype} of shape {shape}")
+        raise DatasetError(f"{shard.path}: field {field.name!r} {text}; {PLAN} says {field.dtype} of shape {shape}")
 
 
 @dataclass(frozen=True, eq=False)

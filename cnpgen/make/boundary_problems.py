@@ -6,7 +6,7 @@ import numpy as np
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.load import as_dataset_recipe
-from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import record_problem
@@ -31,7 +31,7 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
     from cnpgen.pipelines.prepared import PreparedPipeline
 
     n = integer("n", n, least=1)
-    root = None if seed is None else integer("seed", seed, least=0, most=2**63 - 1)
+    root = None if seed is None else integer("seed", seed, least=0, most=MAX_SEED)
     loaded = as_dataset_recipe(recipe)
     backend, cache_folder = choose_backend(None)
     prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")

@@ -58,16 +58,16 @@ class CertifiedPlan(Stage):
 
         solve = load_solver(context.problem, context.robot, context.kernels)
 
-        def run(batch: Round, _random: np.random.Generator) -> None:
-            columns = {name: np.ascontiguousarray(values.T) for name, values in batch.columns.items()}
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
             with one_thread():
                 motion, valid = solve(columns)
-            batch["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)
-            batch["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
-            batch["duration"] = motion.duration()[None]
-            batch.reject(valid, NO_PLAN)
+            draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)
+            draws["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
+            draws["duration"] = motion.duration()[None]
+            draws.reject(valid, NO_PLAN)
 
-        return run
+        return work
 
 
 def certified(recipe: DatasetRecipe) -> DatasetRecipe:

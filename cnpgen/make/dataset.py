@@ -21,6 +21,7 @@ from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import Blueprint, ShardTask, shards
 from cnpgen.store.check import check_documents
 from cnpgen.store.fates import Fates
+from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize, source_date
 from cnpgen.store.mending import discard, find_damaged, made_already
@@ -174,7 +175,7 @@ def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator
         for group in groups:
             yield from make_shards(job, group)
         return
-    advice = f": the shards that are finished are safe in {job.folder}; run the same command again to go on"
+    advice = f": the shards that are finished are safe in {job.folder}; {AGAIN} to go on"
     with closing(share_out(partial(_made, job), groups, workers, advice=advice)) as results:
         for made in results:
             yield from made

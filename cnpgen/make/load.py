@@ -49,7 +49,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
     expected = "the name of a dataset or pipeline, the path of a recipe file or a DatasetRecipe"
     if isinstance(recipe, Pipeline):
         rows = f'DatasetRecipe(name={recipe.name!r}, pipeline=..., splits={{"train": 1000}})'
-        raise UsageError(f"recipe must be {expected}, got a Pipeline: make {rows} of it (cnpgen.problems.problem)")
+        raise UsageError(f"recipe must be {expected}, got a Pipeline: make cnpgen.{rows} of it")
     raise UsageError(f"recipe must be {expected}, got {recipe!r}")
 
 

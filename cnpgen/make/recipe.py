@@ -23,7 +23,7 @@ class DatasetRecipe:
     """How many rows of which pipeline, from which seed, split how.
 
     Attributes:
-        splits: Split name -> rows; the first split takes what rounding leaves when the sizes are scaled by ``--n``.
+        splits: Split name -> rows; the first split takes what rounding leaves when the sizes are scaled by ``n``.
     """
 
     name: str = field("name of the dataset: lower-case letters, digits and hyphens", pattern=NAME)

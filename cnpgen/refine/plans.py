@@ -41,7 +41,7 @@ class Refinement:
     """What came of N plans.
 
     Attributes:
-        given: The plans as they were given.
+        given: The plans as they were given, but with the tip's positions where their joints put it.
         plans: The refined plans, in the same order.
         refined: How each of them ended.
         times: Where the time went; plans that a journal held took none.
@@ -193,7 +193,11 @@ def _run(
     prepare(plans, options)  # kernels are compiled once, not by every worker
     watch.prepared()
     tasks = ((part, plans[np.array(part)]) for part in parts)
-    advice = "" if journal is None else f": {journal.path} holds what is finished; run the same command again to go on"
+    advice = (
+        ""
+        if journal is None
+        else f": {journal.path} holds what is finished; start again with the same arguments to go on"
+    )
     with closing(share_out(partial(_refine, options=options), tasks, count, advice=advice)) as results:
         for part, refined, seconds in results:
             watch.computing += seconds / count

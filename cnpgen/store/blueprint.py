@@ -126,12 +126,12 @@ class Blueprint:
         """The problem whose motions the rows are the ends of.
 
         Raises:
-            DatasetError: The plan does not say.
+            DatasetError: The blueprint does not say.
         """
         try:
             content, urdf = self.recipe["pipeline"]["problem"], self.robot["urdf"]
         except KeyError as error:
-            raise DatasetError(f"the plan of {self.name} lacks {error}, and so does not say its problem") from None
+            raise DatasetError(f"the blueprint of {self.name} lacks {error}, and so does not say its problem") from None
         return StoredProblem(json.dumps(content, ensure_ascii=False), str(urdf))
 
     def field_named(self, name: str) -> Field:

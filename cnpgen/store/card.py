@@ -60,7 +60,7 @@ code with what made them.
 
 
 def card_text(summary: Summary, *, folder: str, notes: str = "") -> str:
-    """Write the card of a finished dataset; it depends on its rows and plan only, not on when or where they were made.
+    """Write the card of a finished dataset; it depends on rows and blueprint only, not on when or where they were made.
 
     Args:
         summary: The finished shards.
@@ -116,13 +116,13 @@ def _making(summary: Summary) -> str:
         "random numbers": blueprint.generator,
         "kernels": blueprint.backend,
         "stored as": blueprint.dtype,
-        "plan": f"fingerprint `{blueprint.fingerprint}`",
+        "blueprint": f"fingerprint `{blueprint.fingerprint}`",
         "made with": ", ".join(f"{name} {version}" for name, version in blueprint.versions.items()),
     }
     lines = [f"- {name}: {value}" for name, value in facts.items() if value]
     return (
         "\n".join(lines)
-        + "\n\nThe same plan with the same versions gives the same bytes, however the work is shared out."
+        + "\n\nThe same blueprint with the same versions gives the same bytes, however the work is shared out."
     )
 
 

@@ -11,6 +11,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shard_attributes, shards
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 from cnpgen.store.manifest import data_fingerprint, load_manifest
 from cnpgen.store.record import load_record
@@ -28,9 +29,12 @@ from cnpgen.store.summary import summarise, unfinished
 _LISTED = (PLAN, STATS, CARD, CROISSANT)
 _NOTHING = "(nothing)"
 
-MAKE_AGAIN = "run the same make-dataset command again: it makes what is damaged or missing and keeps the rest"
-REPLACE = "nothing else says what the dataset was to be: make it again with 'make-dataset --force'"
-DELETE = "delete such a shard and the .json beside it, then run the same make-dataset command again"
+MAKE_AGAIN = f"{AGAIN}: it makes what is damaged or missing and keeps the rest"
+REPLACE = (
+    "nothing else says what the dataset was to be: make it anew with make_dataset(..., force=True) or"
+    " 'cnpgen make-dataset --force'"
+)
+DELETE = f"delete such a shard and the .json beside it, then {AGAIN}"
 REMOVE = "move elsewhere what is not part of the dataset"
 
 
@@ -165,7 +169,7 @@ def check_shard(
     if expected is None:  # nobody knows what the file should be, and findings says why
         return findings
     damage = _check_file(folder, task.file, *expected)
-    if damage and not _is_of_another_plan(path, blueprint):
+    if damage and not _is_of_another_blueprint(path, blueprint):
         return findings + damage  # what HDF5 makes of a damaged file tells nothing, and may take forever
     content = check_content(folder, blueprint, task)
     if findings or damage:  # then make-dataset notices by itself that the shard is not the one that it made
@@ -181,7 +185,7 @@ def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding
     return _check_digest(folder, name, sha256)
 
 
-def _is_of_another_plan(path: Path, blueprint: Blueprint) -> bool:
+def _is_of_another_blueprint(path: Path, blueprint: Blueprint) -> bool:
     """Whether a shard that is not the recorded one is a sound shard of another blueprint."""
     try:
         return read_attributes(path, ["plan_key"])["plan_key"] != blueprint.key

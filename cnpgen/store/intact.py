@@ -5,7 +5,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import file_sha256
 
-AGAIN = "run the same make-dataset command again"
+AGAIN = "run make_dataset or 'cnpgen make-dataset' again with the same arguments"
 
 _intact: set[tuple[Path, int, int, str]] = set()  # path, mtime [ns], size and sha256 of what this process has compared
 

@@ -30,7 +30,7 @@ class ShardRecord:
         sha256: Its digest.
         rows: Its rows.
         first_sample_id: Index of its first row within the split.
-        plan_fingerprint: Fingerprint of the plan it belongs to.
+        plan_fingerprint: Fingerprint of the blueprint it belongs to.
         statistics: Field name -> statistics of its columns.
         fates: Fates of the draws that were made for it.
         started: When the work on it began, ISO 8601 in UTC.

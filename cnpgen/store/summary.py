@@ -9,6 +9,7 @@ from typing import Any
 from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, shards
 from cnpgen.store.fates import Fates, densities_to_json, merge_fates
+from cnpgen.store.intact import AGAIN
 from cnpgen.store.record import ShardRecord, load_committed
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
 
@@ -85,7 +86,7 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = Fa
 
 def unfinished(summary: Summary) -> str:
     """Say how far an unfinished dataset is and what to do."""
-    return f"unfinished: {progress_text(summary)}; run the same make-dataset command again"
+    return f"unfinished: {progress_text(summary)}; {AGAIN}"
 
 
 def progress_text(summary: Summary) -> str:

@@ -85,8 +85,8 @@ def _with_demonstrations(rows: Rows, source: TrainingData, given: Surroundings) 
     shown = source.demonstrations(given.robot.n)
     if shown is None:
         raise UsageError(
-            f"{source.dataset.folder} holds no plans that could be imitated: make it with 'cnpgen make-dataset"
-            " --certify', or train without imitation"
+            f"{source.dataset.folder} holds no plans that could be imitated: make it with"
+            " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
     return replace(rows, shown=shown)
 

@@ -85,7 +85,7 @@ def backend_of(folder: Path, blueprint: Blueprint) -> tuple[Backend, Path]:
     except MachineError as error:
         raise MachineError(
             f"{folder} was made by the {blueprint.backend} backend, which does not work here ({error}): its blocks"
-            " cannot be made again; 'cnpgen validate' and 'cnpgen validate --deep' work without it"
+            " cannot be made again; all checks but regenerate= work without it"
         ) from error
 
 

@@ -11,6 +11,7 @@ from cnpgen.make.recipe import DatasetRecipe, resolved_digest
 from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.files.documents import load_document, plain
+from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import PLAN, STATS
 from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
 
@@ -38,7 +39,7 @@ def check_statistics(folder: Path, blueprint: Blueprint) -> list[Finding]:
     wrong = [key for key in expected if document.get(key) != expected[key]]
     if not wrong:
         return []
-    advice = f"delete {STATS} and run the same make-dataset command again: it writes the file anew"
+    advice = f"delete {STATS} and {AGAIN}: it writes the file anew"
     return [Finding(STATS, f"does not sum up the shards' records: {', '.join(wrong)} differ", advice=advice)]
 
 

@@ -161,7 +161,7 @@ def test_solve_does_not_take_rows_that_were_changed(said: Said, tmp_path: Path, 
     content = bytearray(path.read_bytes())
     content[offset + 48 : offset + 56] = bytes(8)
     path.write_bytes(content)
-    line = f"{path.relative_to(tmp_path)} is damaged: its sha256 is not the recorded one; run the same make-dataset"
+    line = f"{path.relative_to(tmp_path)} is damaged: its sha256 is not the recorded one; run make_dataset"
     for words in (
         ("solve", "{}", "--n", "1"),
         ("plan", "{}", "--model", "airhockey-hit", "--n", "1", "-o", "out.h5"),

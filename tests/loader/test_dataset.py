@@ -84,7 +84,7 @@ def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
 
 
 def test_a_dataset_that_does_not_say_its_problem_is_refused(dataset: Dataset) -> None:
-    with pytest.raises(DatasetError, match="the plan of two-shards lacks 'problem'"):
+    with pytest.raises(DatasetError, match="the blueprint of two-shards lacks 'problem'"):
         _ = dataset.problem
 
 
@@ -282,7 +282,10 @@ def test_a_shard_in_the_place_of_another_is_noticed(copy: Path, tmp_path: Path, 
 def test_a_shard_that_vanishes_while_it_is_in_use_is_an_error_and_not_a_hang(copy: Path) -> None:
     dataset = load_dataset(copy)
     (copy / "train" / "shard-00001.h5").unlink()
-    with pytest.raises(DatasetError, match=r"shard-00001\.h5 is missing; run the same make-dataset command again"):
+    with pytest.raises(
+        DatasetError,
+        match=r"shard-00001\.h5 is missing; run make_dataset or 'cnpgen make-dataset' again with the same arguments",
+    ):
         list(dataset.batches(10))
 
 
@@ -297,7 +300,7 @@ def test_a_damaged_document_is_refused(copy: Path, name: str) -> None:
 def test_statistics_of_another_blueprint_are_refused(copy: Path, tmp_path: Path) -> None:
     other = make(tmp_path / "other", seed=3)
     shutil.copy(other / "stats.json", copy / "stats.json")
-    with pytest.raises(DatasetError, match=r"stats\.json is of another plan"):
+    with pytest.raises(DatasetError, match=r"stats\.json is of another blueprint than plan\.json"):
         load_dataset(copy)
 
 

@@ -102,15 +102,18 @@ def test_a_shard_that_is_cut_off_after_it_was_checked_is_an_error_and_no_crash(s
     reader = ShardReader(verify=True)
     reader.read(shard, FIELDS)
     shard.path.write_bytes(shard.path.read_bytes()[:100])
-    with pytest.raises(DatasetError, match=r"has 100 bytes instead of \d+; run the same make-dataset command again"):
+    with pytest.raises(
+        DatasetError,
+        match=r"has 100 bytes instead of \d+; run make_dataset or 'cnpgen make-dataset' again with the same arguments",
+    ):
         reader.read(shard, FIELDS)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"width": 4}, r"field 'start_q' is float64 of shape \(32, 3\); the plan says float of shape \(32, 4\)"),
-        ({"dtype": "int64"}, r"is float64 of shape \(32, 3\); the plan says int64"),
+        ({"width": 4}, r"field 'start_q' is float64 of shape \(32, 3\); plan.json says float of shape \(32, 4\)"),
+        ({"dtype": "int64"}, r"is float64 of shape \(32, 3\); plan.json says int64"),
         ({"name": "end_q"}, "field 'end_q' is missing"),
     ],
 )

@@ -16,6 +16,7 @@ from cnpgen.planner.omega import Omega
 from cnpgen.planner.planner import Planner
 from cnpgen.problems.load import load_problem
 from cnpgen.trajectory.boundary import Boundary
+from tests.conftest import HANGING
 from tests.examples.models import untrained_model
 
 AIRHOCKEY = load_problem("airhockey")
@@ -51,7 +52,7 @@ def test_an_exception_takes_the_limit_back() -> None:
 
 def test_the_last_python_thread_to_leave_takes_the_limit_back() -> None:
     seen: dict[str, set[int]] = {}
-    steps = Barrier(2, timeout=60)
+    steps = Barrier(2, timeout=HANGING)
 
     def first() -> None:
         with one_thread():

@@ -114,7 +114,9 @@ def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
 
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24_000, "validation": 2000})
     folder = tmp_path / "out"
-    with pytest.raises(MachineError, match=r"a worker died .*finished are safe in .*run the same command again"):
+    with pytest.raises(
+        MachineError, match=r"a worker died .*finished are safe in .*run make_dataset or 'cnpgen make-dataset' again"
+    ):
         make_dataset(recipe, folder, shard_size=1000, workers=2, progress=kill)
     assert len(killed) == 2
     assert 1 <= len(digests(folder)) < 26
@@ -160,7 +162,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_disk_that_is_really_full_loses_nothing(tiny, small_disk):
     folder = small_disk / "out"
     (small_disk / "ballast").write_bytes(bytes(750_000))
-    with pytest.raises(MachineError, match="No space left on device; free some space and run the same command again"):
+    with pytest.raises(MachineError, match="No space left on device; free some space and try again"):
         make_tiny(folder)
     assert not (folder / MANIFEST).exists()
     assert not list(folder.rglob("*.tmp"))

@@ -44,7 +44,9 @@ def test_what_was_finished_before_a_worker_was_killed_is_not_made_again(
     problems: Plans, solved: Plans, tmp_path: Path
 ) -> None:
     journal, begun = tmp_path / "journal", []
-    with pytest.raises(MachineError, match=r"a worker died .*journal holds what is finished; run the same command"):
+    with pytest.raises(
+        MachineError, match=r"a worker died .*journal holds what is finished; start again with the same"
+    ):
         refine_plans(problems, workers=2, journal=journal, progress=kill_workers)
     found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
     ((total, there),) = begun
@@ -66,7 +68,7 @@ def test_a_disk_that_is_full_is_told_with_what_to_do_and_what_fits_counts(
         flush(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(MachineError, match=rf"cannot write {journal}: {os.strerror(number)}; .*run the same command"):
+    with pytest.raises(MachineError, match=rf"cannot write {journal}: {os.strerror(number)}; .*try again"):
         refine_plans(problems, workers=1, journal=journal)
     monkeypatch.undo()
     found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))

@@ -60,7 +60,7 @@ def test_a_failing_disk_is_a_machine_error_that_leaves_the_old_file(
 
 def test_a_full_disk_is_named_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
-    with pytest.raises(MachineError, match=r"free some space and run the same command again"):
+    with pytest.raises(MachineError, match=r"free some space and try again"):
         write_file(tmp_path / "a", b"new")
 
 

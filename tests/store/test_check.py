@@ -12,6 +12,7 @@ from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.check import MAKE_AGAIN, REPLACE, Finding, check_content, check_dataset, check_documents
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import save_document
+from cnpgen.store.intact import AGAIN
 from cnpgen.store.manifest import finalize, load_manifest
 from tests.examples.store import BLUEPRINT, dataset, make_shard, make_shards
 
@@ -145,7 +146,7 @@ def test_unfinished_datasets_are_reported_with_what_to_do(tmp_path: Path) -> Non
     write_blueprint(tmp_path, BLUEPRINT)
     for task in shards(BLUEPRINT)[:2]:
         make_shard(tmp_path, BLUEPRINT, task)
-    message = "is missing: the dataset is unfinished: 2 of 3 shards are there; run the same make-dataset command again"
+    message = f"is missing: the dataset is unfinished: 2 of 3 shards are there; {AGAIN}"
     assert check_dataset(tmp_path) == [Finding("manifest.json", message, advice=MAKE_AGAIN)]
     make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[2])
     assert "unfinished: all shards are there, but they were not summed up" in problems(tmp_path)["manifest.json"]

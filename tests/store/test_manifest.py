@@ -115,7 +115,9 @@ def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_pa
     make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
     with pytest.raises(DatasetError) as caught:
         finalize(tmp_path, BLUEPRINT)
-    assert "1 of 3 shards are there; run the same make-dataset command again" in str(caught.value)
+    assert "1 of 3 shards are there; run make_dataset or 'cnpgen make-dataset' again with the same arguments" in str(
+        caught.value
+    )
     assert "train/shard-00000.json is missing" in str(caught.value)
     assert "validation/shard-00000.json is missing" in str(caught.value)
     assert "shard-00001" not in str(caught.value)

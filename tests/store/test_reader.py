@@ -65,7 +65,7 @@ def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
     write_blueprint(tmp_path, BLUEPRINT)
     make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
-    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run the same"):
+    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run make_dataset or"):
         open_dataset(tmp_path)
     opened = open_dataset(tmp_path, allow_incomplete=True)
     assert opened.manifest is None
@@ -77,7 +77,8 @@ def test_damaged_parts_are_refused(dataset: Path) -> None:
     path = dataset / shards(BLUEPRINT)[0].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
-        DatasetError, match=r"shard-00000\.h5 has \d+ bytes instead of \d+; run the same make-dataset command again"
+        DatasetError,
+        match=r"shard-00000\.h5 has \d+ bytes instead of \d+; run make_dataset or",
     ):
         open_dataset(dataset).read("train")
     (dataset / "manifest.json").write_text("{")
@@ -109,7 +110,7 @@ def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset:
     with pytest.raises(DatasetError) as by_loader:
         load_dataset(dataset, allow_incomplete=not finished).arrays("train")
     assert str(by_rows.value) == str(by_shards.value) == str(by_loader.value)
-    assert "shard-00001.h5 is damaged: its sha256 is not the recorded one; run the same" in str(by_rows.value)
+    assert "shard-00001.h5 is damaged: its sha256 is not the recorded one; run make_dataset or" in str(by_rows.value)
 
 
 def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:

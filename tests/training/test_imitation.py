@@ -116,7 +116,7 @@ def test_an_imitating_run_that_was_cut_goes_on_exactly(shown, tmp_path, monkeypa
 
 
 def test_a_dataset_without_plans_cannot_be_imitated(tiny, tmp_path):
-    with pytest.raises(UsageError, match=r"holds no plans that could be imitated.*--certify"):
+    with pytest.raises(UsageError, match=r"holds no plans that could be imitated.*certify=True.*--certify"):
         train_model(tiny("airhockey-hit"), tmp_path / "m.h5", steps=4, settings=replace(SMALL, imitation=0.5))
 
 

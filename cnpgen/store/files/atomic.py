@@ -13,8 +13,8 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, MachineError
 
 _HINTS = {
-    errno.ENOSPC: "free some space and run the same command again",
-    errno.EDQUOT: "your quota is used up; free some space and run the same command again",
+    errno.ENOSPC: "free some space and try again",
+    errno.EDQUOT: "your quota is used up; free some space and try again",
     errno.EFBIG: "the file is larger than this system or session allows (see ulimit -f)",
     errno.EROFS: "the file system is read-only; choose another folder",
     errno.EACCES: "choose a folder that you may write to",
@@ -39,7 +39,7 @@ def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
     Returns:
         The error to raise from ``error``.
     """
-    hint = _HINTS.get(error.errno or 0, "check the disk and run the same command again")
+    hint = _HINTS.get(error.errno or 0, "check the disk and try again")
     return MachineError(f"cannot {verb} {path}: {error.strerror or error}; {hint}")
 
 
