@@ -82,7 +82,7 @@ def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
 
 @pytest.mark.parametrize("given", [HEAVY, RECORD, "heavy-object"])
 def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Problem) -> None:
-    loss, omega = PlanLoss(given), Omega(given)
+    loss, omega = PlanLoss(given), Omega(given, landing_steps=0)  # whose kernels would be long to compile
     q = np.tile(HEAVY.robot.base, (2, 1))
     zero = np.zeros_like(q)
     tasks = omega.tasks(Boundary(q, zero, zero, q + 0.1, zero))

@@ -16,7 +16,7 @@ from tests.refine.test_solver import transcription
 PROBLEMS = {"hit": "airhockey", "replan": "airhockey", "transport": "heavy-object"}
 
 
-@pytest.mark.parametrize("label", ["hit", "replan"])
+@pytest.mark.parametrize("label", ["hit", pytest.param("replan", marks=pytest.mark.extended)])
 def test_a_pass_ends_at_least_as_good_as_ipopts_from_the_same_start(label: str) -> None:
     asked, tool = task(load(label)), refiner(PROBLEMS[label])
     which, x = tool.passes.first, tool.straight(asked)
