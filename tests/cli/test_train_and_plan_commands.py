@@ -30,6 +30,12 @@ def trained(tiny, tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    """Learning curves are not drawn: that takes longer than so short a training."""
+    monkeypatch.setattr("cnpgen.training.curve.plot_curve", lambda *_: None)
+
+
 def failing(capsys, words: list[str]) -> tuple[int, str]:
     code = main(words)
     captured = capsys.readouterr()
@@ -57,6 +63,7 @@ def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tm
     assert training["dataset"]["rows"] == {"train": 600, "validation": 60}
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("often", [0, 100])
 def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):
     monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
@@ -64,6 +71,7 @@ def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monk
     assert ("a planner from more rows is better" in capsys.readouterr().err) == (often == 0)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_batches_of_more_rows_than_there_are_are_spoken_of(tiny, tmp_path, capsys):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]
     said = re.compile(r"every step takes all ([\d,]+) rows: there are no 5,000 for a batch")
@@ -75,6 +83,7 @@ def test_batches_of_more_rows_than_there_are_are_spoken_of(tiny, tmp_path, capsy
     assert "every step takes all" not in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_checkpoint_of_another_run_is_a_wrong_argument(tiny, tmp_path, capsys, monkeypatch):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]
     with monkeypatch.context() as patch:
@@ -98,6 +107,7 @@ def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
     assert trained.read_bytes() == before
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path):
     path = tmp_path / "m.h5"
     chosen = ["--growth", "3", "--learning-rate", "2e-3", "--seed", "7", "--metric", "bounded", "--quiet"]
@@ -122,6 +132,7 @@ def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_pa
     assert (tmp_path / "m.checkpoint").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_in_a_model_is_the_one_that_was_given(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tiny("airhockey-hit"))
     path = tmp_path / "my model.h5"

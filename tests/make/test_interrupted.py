@@ -36,8 +36,11 @@ def times(folder: Path) -> dict[str, int]:
     return {path.name + path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/*.h5")}
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("error", [KeyboardInterrupt, Interrupted])
+@pytest.mark.parametrize(
+    ("error", "workers"),
+    [(KeyboardInterrupt, 2), (Interrupted, 1)]
+    + [pytest.param(*each, marks=pytest.mark.extended) for each in ((KeyboardInterrupt, 1), (Interrupted, 2))],
+)
 def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, workers, error):
     folder = tmp_path / "out"
 

@@ -49,8 +49,14 @@ def duration(found: Refined) -> float:
 
 
 @pytest.mark.parametrize("label", LABELS)
-@pytest.mark.parametrize("goal_acceleration", [False, True])
-@pytest.mark.parametrize("kind", [None, "centrifugal", "effort", "jerk"])
+@pytest.mark.parametrize(
+    ("kind", "goal_acceleration"),
+    [(None, False), (None, True), ("centrifugal", True), ("effort", False), ("jerk", True)]
+    + [
+        pytest.param(*each, marks=pytest.mark.extended)
+        for each in (("centrifugal", False), ("effort", True), ("jerk", False))
+    ],
+)
 def test_gradients_of_residuals_and_objective_are_those_of_finite_differences(
     label: str, goal_acceleration: bool, kind: str | None
 ) -> None:
