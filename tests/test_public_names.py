@@ -27,6 +27,7 @@ INNER = {  # classes that public signatures name, but that nobody is meant to ma
     "Shard": "what Dataset reads rows from",
     "ShardReader": "likewise",
     "SplitShards": "likewise",
+    "Unsaid": "stands for an argument that was not given",
 }
 
 

@@ -116,7 +116,8 @@ def test_the_digest_changes_with_stages_problem_and_urdf(recipe, tmp_path):
         recipe_digest(changed(recipe, problem=replace(problem, limits=LimitSpec(velocity_scale=0.5)))),
     }
     (tmp_path / "arm.urdf").write_text("<robot name='leg'/>")
-    others.add(recipe_digest(recipe))
+    assert recipe_digest(recipe) == digest  # the URDF is read once: all of a problem is of one text
+    others.add(recipe_digest(changed(recipe, problem=replace(problem))))
     assert len(others | {digest}) == 5
 
 
