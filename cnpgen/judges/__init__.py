@@ -1,1 +1,1 @@
-"""The independent judge: rows recomputed with Pinocchio and Coal, sharing no code with the stages or the kernels."""
+"""The independent judges of rows and plans: Pinocchio and Coal, sharing no code with stages, kernels or the refiner."""

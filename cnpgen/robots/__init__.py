@@ -1,1 +1,1 @@
-"""Robots: the numeric model behind Pinocchio, and the same chain as CasADi SX expressions."""
+"""The numeric robot: its Pinocchio model and chain, its limits, and what a problem file says of it."""

@@ -1,1 +1,1 @@
-"""The robot among its obstacles as Pinocchio and Coal see it: what judges use, and solvers never do."""
+"""The robot among its obstacles as Pinocchio and Coal see it: what constraints are measured by."""
