@@ -28,11 +28,39 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     Returns:
         Shape (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of the spline.
     """
-    from scipy.interpolate import BSpline
+    knots, worth = clamped_knots(points, degree), np.eye(points)
+    for p in range(degree, degree - order, -1):  # control points of the derivative, in place of the function's
+        worth = np.diff(worth, axis=0) * p / (knots[p + 1 : -1] - knots[1 : -p - 1])[:, None]
+        knots = knots[1:-1]
+    degree -= order
+    first = np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(worth) - 1) - degree
+    values = np.zeros((len(s), points))
+    for k, weight in enumerate(_cox_de_boor(s, knots, degree, first)):
+        values += weight[:, None] * worth[first + k]
+    return values
 
-    spline = BSpline(clamped_knots(points, degree), np.eye(points), degree)
-    values: Array = spline.derivative(order)(s) if order else spline(s)
-    return np.ascontiguousarray(values)
+
+def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -> Array:
+    """Evaluate the D + 1 basis functions that are not 0 at phases s, by the recursion that SciPy uses, too.
+
+    Args:
+        s: Phases, shape (K,).
+        knots: Knots.
+        degree: Degree D.
+        first: Index of the first of these basis functions at every phase, shape (K,).
+
+    Returns:
+        Shape (D + 1, K).
+    """
+    weights = np.ones((1, len(s)))
+    right = first + degree + 1 + np.arange(degree)[:, None]
+    for p in range(1, degree + 1):
+        high, low = knots[right[:p]], knots[right[:p] - p]
+        share = weights / (high - low)
+        weights = np.zeros((p + 1, len(s)))
+        weights[1:] = share * (s - low)
+        weights[:-1] += share * (high - s)
+    return weights
 
 
 def pieces(control: Array, degree: int) -> Array:
