@@ -5,16 +5,21 @@ control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or dist
 """
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.judges.plans.closer import keep_worse, look_closer
+from cnpgen.judges.plans.between import polynomials
+from cnpgen.judges.plans.closer import look_closer
 from cnpgen.judges.plans.course import course, jerks
-from cnpgen.judges.plans.measure import boundary_margins, by_name, constraint_margins
+from cnpgen.judges.plans.limits import is_proven, limit_margin
+from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.paper import paper_rule
+from cnpgen.judges.plans.peaks import look_at_peaks
 from cnpgen.judges.plans.sampling import Samples, sample, time_table
+from cnpgen.judges.plans.survey import Survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
@@ -160,22 +165,32 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
 
 def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
-    samples = _samples(plan, step)
-    if isinstance(samples, Verdict):
-        return samples
+    found = _samples(plan, step)
+    if isinstance(found, Verdict):
+        return found
+    samples, table = found
     states = course(plan.motion, samples.s)
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
-    margins = [
-        *boundary_margins(states, plan.boundary, samples, world.robot.joint_names),
-        *constraint_margins(plan.problem, world, samples),
-    ]
+    start_tip = world.tip_position[:, 0].copy()
+    pieces = polynomials(plan.motion)
+    others = [each for each in plan.problem.constraint if not is_proven(each)]
+    measured = [found for each in others for found in measure(each, world, samples.s, start_tip)]
+    worst = {id(each): each.margin(plan.problem, samples) for each in measured}
+    proven = {id(each): limit_margin(each, world, pieces, table) for each in plan.problem.constraint if is_proven(each)}
+    ends = boundary_margins(states, plan.boundary, samples, world.robot.joint_names)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
         metrics = _metrics(plan, world, samples)
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
-    margins = keep_worse(margins, look_closer(plan.problem, world, plan.motion, samples, plan.tops))
+    survey = Survey(plan.problem, plan.motion, plan.tops, samples, table, start_tip, world, measured)
+    for each, margin in chain(look_closer(survey), look_at_peaks(survey)):
+        worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
+    by_constraint = {id(each): [proven[id(each)]] if id(each) in proven else [] for each in plan.problem.constraint}
+    for each in measured:
+        by_constraint[id(each.constraint)].append(worst[id(each)])
+    margins = [*ends, *chain.from_iterable(by_constraint.values())]
     return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
@@ -188,13 +203,15 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
-    if not all(margin.ok for margin in constraint_margins(plan.problem, world, samples)):
+    start_tip = world.tip_position[:, 0]
+    found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
+    if not all((each.share <= 1).all() for each in found):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
 
 
-def _samples(plan: _Plan, step: float) -> Samples | Verdict:
-    """Choose where to look, or say why there is nothing to look at."""
+def _samples(plan: _Plan, step: float) -> tuple[Samples, Array] | Verdict:
+    """Choose where to look, and tell the times of ``table_phases()`` [s], or say why there is nothing to look at."""
     if not plan.is_finite():
         return Verdict(Reason.NOT_FINITE)
     if not plan.motion.runs_forward()[0]:
@@ -202,7 +219,8 @@ def _samples(plan: _Plan, step: float) -> Samples | Verdict:
     rate, degree = plan.motion.rate[0], plan.motion.degree
     table = time_table(rate, degree)
     spans = max(plan.motion.path.shape[1], len(rate)) - degree
-    return sample(table, step, spans) or Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
+    samples = sample(table, step, spans)
+    return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
 
 
 def _reason(margins: list[Margin]) -> str:
