@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spline import basis
+from cnpgen.trajectory.spline import derivative
 
 Array = NDArray[np.float64]
 
@@ -43,12 +43,10 @@ class Pieces:
 def polynomials(motion: Motion) -> Pieces:
     """Return the polynomials of one motion."""
     degree = motion.degree
-    edges = _edges(motion.path.shape[1], motion.rate.shape[1], degree)
-    width = np.diff(edges)[:, None]
-    p = _in_bernstein_form(motion.path[0], degree, edges)
-    r = _in_bernstein_form(motion.rate[0, :, None], degree, edges)
-    p1, r1 = _derivative(p, width), _derivative(r, width)
-    p2 = _derivative(p1, width)
+    degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
+    edges = _edges(len(path), len(rate), degree)
+    p, p1, p2 = (_in_bernstein_form(path, degree, order, edges) for order in range(3))
+    r, r1 = (_in_bernstein_form(rate, degree, order, edges) for order in range(2))
     return Pieces(edges, q=p, dq=_product(p1, r), ddq=_product(_product(p2, r) + _product(p1, r1), r))
 
 
@@ -91,29 +89,44 @@ def _edges(path_points: int, rate_points: int, degree: int) -> Array:
     return np.array([knots[key] for key in sorted(knots)])
 
 
-def _in_bernstein_form(control: Array, degree: int, edges: Array) -> Array:
-    """Return a spline's coefficients between edges, shape (n, S, D + 1); ``control`` has shape (C, n)."""
-    matrix = _to_bernstein_form(len(control), degree, tuple(edges.tolist()))
-    return np.ascontiguousarray((matrix @ control).reshape(len(edges) - 1, degree + 1, -1).transpose(2, 0, 1))
+def _in_bernstein_form(control: Array, degree: int, order: int, edges: Array) -> Array:
+    """Return a derivative of splines between edges, shape (n, S, D - order + 1); ``control`` has shape (C, n)."""
+    matrix = _to_bernstein_form(len(control), degree, order, tuple(edges.tolist()))
+    pieces = (matrix @ control).reshape(len(edges) - 1, degree - order + 1, -1)
+    return np.ascontiguousarray(pieces.transpose(2, 0, 1))
 
 
 @cache
-def _to_bernstein_form(points: int, degree: int, edges: tuple[float, ...]) -> Array:
-    """Return the matrix from control points to Bernstein coefficients between edges, shape (S (D + 1), C).
+def _to_bernstein_form(points: int, degree: int, order: int, edges: tuple[float, ...]) -> Array:
+    """Return the matrix from control points to a derivative's Bernstein coefficients, shape (S (D - order + 1), C).
 
-    The coefficients interpolate the spline at D + 1 Chebyshev points inside each piece.
+    The coefficients between a and b are the values of the derivative's polar form, at arguments of which ever more are
+    b instead of a (Ramshaw, "Blossoms are polar forms", 1989).
     """
-    x = (1 - np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))) / 2
-    powers = np.arange(degree + 1)
-    values = [comb(degree, k) for k in powers] * x[:, None] ** powers * (1 - x[:, None]) ** (degree - powers)
-    inverse = np.linalg.inv(values)
-    pieces = [inverse @ basis(low + (high - low) * x, points, degree) for low, high in pairwise(edges)]
-    return np.concatenate(pieces)
+    knots, matrix = derivative(points, degree, order)
+    degree -= order
+    rows = []
+    for low, high in pairwise(edges):
+        last = int(np.searchsorted(knots, (low + high) / 2)) - 1
+        rows += [_polar(knots, last, [low] * (degree - k) + [high] * k) for k in range(degree + 1)]
+    return np.asarray(np.array(rows) @ matrix)
 
 
-def _derivative(coefficients: Array, width: Array) -> Array:
-    """Differentiate with respect to s; ``width`` of the pieces has shape (S, 1)."""
-    return np.asarray((coefficients.shape[-1] - 1) * np.diff(coefficients, axis=-1) / width)
+def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
+    """Return what every control point contributes to a polar form, by de Boor's recursion, shape (C,).
+
+    Args:
+        knots: Knots.
+        last: Index of the last control point that counts between these knots.
+        arguments: Phases, as many as the degree.
+    """
+    degree = len(arguments)
+    worth = np.eye(len(knots) - degree - 1)[last - degree : last + 1]
+    for p, s in enumerate(arguments, start=1):
+        k = np.arange(last - degree + p, last + 1)
+        share = ((s - knots[k]) / (knots[k + degree - p + 1] - knots[k]))[:, None]
+        worth = (1 - share) * worth[:-1] + share * worth[1:]
+    return np.asarray(worth[0])
 
 
 def _product(a: Array, b: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Check plans with Pinocchio and Coal on a fine time grid.
+"""Check plans with Pinocchio and Coal, on a fine time grid and between its moments.
 
 With what optimised them it shares the problem, with its bounds, tolerances and where its obstacles stand, and what
 control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or distances, and no transcription.
@@ -19,7 +19,7 @@ from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.paper import paper_rule
 from cnpgen.judges.plans.peaks import look_at_peaks
 from cnpgen.judges.plans.sampling import Samples, sample, time_table
-from cnpgen.judges.plans.survey import Survey
+from cnpgen.judges.plans.survey import Survey, survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
@@ -48,11 +48,12 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
 ) -> list[Verdict]:
     """Judge N plans, each for itself: what one of them holds changes nothing about the others.
 
-    Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
-    and at more of them near both ends (``cnpgen.judges.plans.sampling``). A plan is valid if it meets its boundary
-    conditions and exceeds every bound by no more than the constraint allows. Numbers that cannot be evaluated give a
-    verdict that says so, no exception. What lies between two samples is not seen; only contacts, whose depth has sharp
-    peaks, are looked at more closely wherever more than is allowed could hide (``cnpgen.judges.plans.closer``).
+    A plan is valid if it meets its boundary conditions and exceeds every bound by no more than the constraint allows,
+    at every moment. Limits of joint positions, velocities and accelerations are proven to hold between any two moments
+    (``cnpgen.judges.plans.between``). Every other constraint's ``measured`` form is evaluated with Pinocchio and Coal
+    at moments no further than ``step`` apart and at more of them near both ends (``sampling``); then around every
+    maximum that could decide, until nothing is left to gain (``peaks``), and between moments where contacts could hide
+    more than is allowed (``closer``). Numbers that cannot be evaluated give a verdict that says so, no exception.
 
     Args:
         problem: The problem.
@@ -173,25 +174,26 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
-    start_tip = world.tip_position[:, 0].copy()
-    pieces = polynomials(plan.motion)
-    others = [each for each in plan.problem.constraint if not is_proven(each)]
-    measured = [found for each in others for found in measure(each, world, samples.s, start_tip)]
-    worst = {id(each): each.margin(plan.problem, samples) for each in measured}
-    proven = {id(each): limit_margin(each, world, pieces, table) for each in plan.problem.constraint if is_proven(each)}
     ends = boundary_margins(states, plan.boundary, samples, world.robot.joint_names)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
         metrics = _metrics(plan, world, samples)
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
-    survey = Survey(plan.problem, plan.motion, plan.tops, samples, table, start_tip, world, measured)
+    margins = [*ends, *_margins(survey(plan.problem, plan.motion, plan.tops, world, samples, table))]
+    return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
+
+
+def _margins(survey: Survey) -> list[Margin]:
+    """Measure every constraint, at the samples and between them; the survey's world is moved."""
+    worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
     for each, margin in chain(look_closer(survey), look_at_peaks(survey)):
         worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
-    by_constraint = {id(each): [proven[id(each)]] if id(each) in proven else [] for each in plan.problem.constraint}
-    for each in measured:
-        by_constraint[id(each.constraint)].append(worst[id(each)])
-    margins = [*ends, *chain.from_iterable(by_constraint.values())]
-    return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
+    pieces, margins = polynomials(survey.motion), []
+    for constraint in survey.problem.constraint:
+        if is_proven(constraint):
+            margins.append(limit_margin(constraint, survey.world, pieces, survey.table))
+        margins += [worst[id(each)] for each in survey.measured if each.constraint is constraint]
+    return margins
 
 
 def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
@@ -219,7 +221,8 @@ def _samples(plan: _Plan, step: float) -> tuple[Samples, Array] | Verdict:
     rate, degree = plan.motion.rate[0], plan.motion.degree
     table = time_table(rate, degree)
     spans = max(plan.motion.path.shape[1], len(rate)) - degree
-    samples = sample(table, step, spans)
+    kinks = {s for constraint in plan.problem.constraint for s in constraint.kinks}
+    samples = sample(table, step, spans, kinks)
     return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
 
 

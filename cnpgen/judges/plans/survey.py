@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.course import course
+from cnpgen.judges.plans.limits import is_proven
 from cnpgen.judges.plans.measure import Measured, measure
 from cnpgen.judges.plans.sampling import Samples, table_phases
 from cnpgen.judges.plans.verdict import Margin
@@ -58,3 +59,22 @@ class Survey:
     def margin(self, found: Measured, s: Array) -> Margin:
         """Say where a condition that was measured at phases s is closest to being broken, or broken most."""
         return found.margin(self.problem, Samples(s, self.time(s)))
+
+
+def survey(  # noqa: PLR0917 - each of them is half of what is surveyed
+    problem: Problem, motion: Motion, tops: Array, world: PathWorld, samples: Samples, table: Array
+) -> Survey:
+    """Measure all that is not proven of one motion, where the robot is.
+
+    Args:
+        problem: The problem.
+        motion: One motion.
+        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        world: The robot at the samples.
+        samples: When and at which phases that is.
+        table: Times of the motion at ``table_phases()`` [s].
+    """
+    start_tip = world.tip_position[:, 0].copy()
+    others = [constraint for constraint in problem.constraint if not is_proven(constraint)]
+    measured = [each for constraint in others for each in measure(constraint, world, samples.s, start_tip)]
+    return Survey(problem, motion, tops, samples, table, start_tip, world, measured)

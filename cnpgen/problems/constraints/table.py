@@ -21,6 +21,7 @@ class Table(Constraint):
     """The tip in a rectangle at the table's height; at the ends also ``dz/dt = 0`` and ``d2z/dt2 = 0``."""
 
     reason = "off the table"
+    kinks = FUNNEL
     x: Range = field("where the tip may be along world x", unit="m")
     y: Range = field("where the tip may be along world y", unit="m")
     z: float = field("height of the tip when the mallet lies on the table", unit="m")
