@@ -13,7 +13,7 @@ NAMES = {"position": "q", "velocity": "dq", "acceleration": "ddq"}
 
 
 def beyond(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """How far a quantity is beyond its planning limits [its unit], by SciPy, shape (n, K), and in shares of what is wide."""
+    """How far a quantity is beyond its planning limits, by SciPy, shape (n, K), and of what tolerances are shares."""
     values = getattr(course(plan, count), NAMES[quantity]).T
     robot = plan.robot
     if quantity == "position":
