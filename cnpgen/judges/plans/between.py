@@ -18,8 +18,8 @@ from cnpgen.trajectory.spline import derivative
 
 Array = NDArray[np.float64]
 
-CLOSE = 1e-6  # how far below the largest value the one that is found may be
-ROUGH = 1e-3  # the same where the largest value is below 1, so that nothing depends on it
+CLOSE = 1e-6  # how far below the largest value the one that is found may be, where that decides whether it is above 1
+ROUGH = 1e-3  # the same elsewhere
 HALVINGS = 40  # at most: pieces are then shorter than a picosecond
 
 
@@ -51,7 +51,7 @@ def polynomials(motion: Motion) -> Pieces:
 
 
 def largest(rows: Array, edges: Array) -> tuple[float, int, float]:
-    """Find the largest value of piecewise polynomials: to within ``CLOSE``, or ``ROUGH`` where it is below 1.
+    """Find the largest value of piecewise polynomials to within ``ROUGH``, and whether it is above 1 to ``CLOSE``.
 
     Args:
         rows: Bernstein coefficients of M functions, finite, shape (M, S, d + 1).
@@ -71,7 +71,7 @@ def largest(rows: Array, edges: Array) -> tuple[float, int, float]:
             if pieces[top, k] > best:
                 best, at = float(pieces[top, k]), (int(of_row[top]), float(s[top]))
         hull = pieces.max(axis=1)
-        open_ = hull > best + np.where(hull < 1, ROUGH, CLOSE)
+        open_ = hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH)
         if not open_.any():
             break
         pieces, of_row, left, width = pieces[open_], of_row[open_], left[open_], width[open_] / 2

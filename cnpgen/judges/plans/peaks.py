@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 CAUTION = 4.0  # times the parabola's height: third derivatives are not looked at
-GAIN = 1e-7  # of what is allowed: less does not matter
+CLOSE = 1e-7  # of what is allowed: less is not looked for where it decides whether more is exceeded than that
+ROUGH = 1e-3  # the same elsewhere
 ROUNDS = 24  # at most; a smooth maximum takes three, a kink one per halving
 MOST = 64  # maxima of all conditions that are looked into
 
@@ -96,7 +97,8 @@ def _promising(brackets: _Brackets, measured: Sequence[Measured]) -> _Brackets:
 
 def _worth(brackets: _Brackets) -> _Brackets:
     """Keep those between whose samples something is left to gain."""
-    return brackets[CAUTION * _height(brackets) > GAIN]
+    top, gain = brackets.share[:, 1], CAUTION * _height(brackets)
+    return brackets[gain > np.where((top <= 1) & (top + gain > 1), CLOSE, ROUGH)]
 
 
 def _vertex(brackets: _Brackets) -> tuple[Array, Array]:
