@@ -82,7 +82,7 @@ class Evaluation:
 def evaluate_plans(
     plans: Plans, *, step: float = STEP, workers: int | None = None, progress: Callable[[int], None] | None = None
 ) -> Evaluation:
-    """Judge plans with Pinocchio and Coal on a fine time grid.
+    """Judge plans with Pinocchio and Coal, on a fine time grid and between its moments.
 
     Every plan is judged for itself: neither the others nor the number of processes change its verdict. Plans that
     cannot be evaluated get a verdict that says so. Where a column ``start_xyz`` or ``goal_xyz`` is not where the joints
