@@ -29,7 +29,7 @@ def test_the_largest_value_is_that_of_a_very_fine_grid(label: str, seed: int) ->
     rows = pieces.ddq / np.abs(pieces.ddq).max() * 3
     found, row, s = largest(rows, pieces.edges)
     grid = value(rows, pieces.edges, np.linspace(0, 1, 20001))
-    assert grid.max() - CLOSE <= found <= grid.max() + 1e-5  # the grid's own gaps
+    assert grid.max() - ROUGH <= found <= grid.max() + 1e-5  # the grid's own gaps
     assert row == np.argmax(grid.max(axis=1))
     assert value(rows, pieces.edges, np.array([s]))[row, 0] == pytest.approx(found, abs=1e-9)
 
@@ -39,14 +39,16 @@ def test_a_peak_between_any_two_moments_of_a_grid_is_found() -> None:
     at = 1 / np.pi
     rows = np.array([[[2 - at**2, 2 - at**2 + at, 2 - (1 - at) ** 2]]])  # 2 - (s - at)^2 in Bernstein form
     found, row, s = largest(rows, np.array([0.0, 1.0]))
-    assert (found, row, s) == (pytest.approx(2, abs=CLOSE), 0, pytest.approx(at, abs=1e-3))
+    assert (found, row, s) == (pytest.approx(2, abs=ROUGH), 0, pytest.approx(at, abs=0.03))
 
 
-def test_far_from_a_bound_less_is_asked_for() -> None:
+@pytest.mark.parametrize("top", [1 + 2 * CLOSE, 1 - 1e-9])
+def test_whether_a_peak_is_above_1_is_known_exactly(top: float) -> None:
     at = 1 / np.pi
-    rows = np.array([[[-(at**2), at - at**2, -((1 - at) ** 2)]]])
+    rows = np.array([[[top - at**2, top - at**2 + at, top - (1 - at) ** 2]]])
     found, _, _ = largest(rows, np.array([0.0, 1.0]))
-    assert -ROUGH <= found <= 0
+    assert top - CLOSE <= found <= top
+    assert (found > 1) == (top > 1)
 
 
 def test_a_constant_is_its_own_largest_value() -> None:
