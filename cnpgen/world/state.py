@@ -103,6 +103,22 @@ class World:
         return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).linear)
 
     @property
+    def tip_angular_velocity(self) -> Array:
+        """Angular velocity of the tip [rad/s], shape (3,)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).angular)
+
+    @property
+    def tip_angular_acceleration(self) -> Array:
+        """Angular acceleration of the tip [rad/s^2], shape (3,)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.getFrameAcceleration(self._model, self._data, self._tip, frame).angular)
+
+    @property
     def tip_jacobian(self) -> Array:
         """Translational Jacobian of the tip in world axes [m], shape (3, n)."""
         import pinocchio as pin
