@@ -14,8 +14,8 @@ from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import PLAN, STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.statistics import FieldStatistics, statistics_from_json
-from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise
+from cnpgen.store.statistics import FieldStatistics, are_of, statistics_from_json
+from cnpgen.store.summary import STATS_FORM, STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise
 
 Statistics = dict[str, dict[str, FieldStatistics]]
 
@@ -85,13 +85,19 @@ def _listed(folder: Path, blueprint: Blueprint, manifest: Mapping[str, Any]) -> 
 def _load_statistics(folder: Path, blueprint: Blueprint) -> Statistics:
     """Read the statistics of a finished dataset."""
     path = folder / STATS
-    document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+    document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION, form=STATS_FORM)
     if document["plan_fingerprint"] != blueprint.fingerprint:
         raise DatasetError(f"{path} is of another blueprint than {PLAN}; {AGAIN}")
-    return {
-        split: {name: statistics_from_json(content) for name, content in fields.items()}
-        for split, fields in document["splits"].items()
-    }
+    try:
+        found = {
+            split: {name: statistics_from_json(content) for name, content in fields.items()}
+            for split, fields in document["splits"].items()
+        }
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: {error}; {AGAIN}") from error
+    if not all(are_of(statistics, blueprint.fields) for statistics in found.values()):
+        raise DatasetError(f"{path} is of other fields than {PLAN}; {AGAIN}")
+    return found
 
 
 def _present(
