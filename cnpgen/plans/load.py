@@ -170,8 +170,8 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
     record = ProblemRecord(_text(path, attributes, "problem_recipe"), _text(path, attributes, "problem_urdf"))
     try:
         same = record.comparable_sha256 == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{path} is damaged: its problem_recipe is not that of a problem: {error}") from error
+    except RecipeError as error:
+        raise DatasetError(f"{path} is damaged: its attribute 'problem_recipe': {error}") from error
     if not same:
         raise DatasetError(f"{path} is damaged: its problem was changed after it was written")
     return record

@@ -304,7 +304,7 @@ def test_another_robot_file_is_another_problem() -> None:
         ({"attributes": {"problem": "no/problem.toml"}}, "no such file: .*problem.toml"),
         ({"attributes": {"problem": 3}}, "attribute 'problem' must be a text, got"),
         ({"attributes": {"degree": 7.5}}, "attribute 'degree' must be an integer, got"),
-        ({"attributes": {"degree": 1}}, "degree must be an integer from 3 on, got 1"),
+        ({"attributes": {"degree": 1}}, "degree must be an integer from 3 to 20, got 1"),
         ({"attributes": {"degree": [7, 7]}}, "attribute 'degree' must be an integer"),
         ({"attributes": {"format": "cnpgen-shard"}}, "is a cnpgen-shard file, not one of plans"),
         ({"attributes": {"format_version": 2}}, "format version 2, this cnpgen reads 1: upgrade"),
@@ -623,7 +623,7 @@ def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(tmp_path
         ({"sample_id": np.full(3, 2**63, np.uint64)}, "sample_id must hold integers from .* to 9223372036854775807"),
         ({"sample_id": ["a", "b", "c"]}, "sample_id must be an array of integers"),
         ({"status": [300, 0, 0]}, "status must hold integers from 0 to 255"),
-        ({"degree": 7.5}, "degree must be an integer from 3 on, got 7.5"),
+        ({"degree": 7.5}, "degree must be an integer from 3 to 20, got 7.5"),
         ({"columns": {".": np.zeros(3)}}, "a column cannot be called '.'"),
     ],
 )
