@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.format import ATTRIBUTES, BOUNDARY
+from cnpgen.plans.format import FORMAT as PLANS
+from cnpgen.plans.format import FORMAT_VERSION as PLANS_VERSION
 from cnpgen.plans.load import stored_problem
 from cnpgen.problems.record import ProblemRecord, as_record
 from cnpgen.store.blueprint import Blueprint, load_blueprint
 from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.sealed import has_seal
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.store.shard import FORMAT
 from cnpgen.trajectory.boundary import Boundary
@@ -103,6 +106,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     require_file(path, "a dataset or an HDF5 file of boundary conditions")
     if (kind := file_kind(path)).endswith(" of cnpgen"):
         raise DatasetError(f"{path} is {kind}, not an HDF5 file of boundary conditions")
+    has_seal(path, kind=PLANS, version=PLANS_VERSION)
     with opened_hdf5(path) as file:
         attributes = file.attributes.some(SAID)
         columns = {name: file[name].read() for name in ASKED if name in file}

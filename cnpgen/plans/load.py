@@ -18,6 +18,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, as_record, record_problem
 from cnpgen.store.blueprint import StoredProblem
 from cnpgen.store.files.hdf5 import Column, Hdf5, opened_hdf5
+from cnpgen.store.files.sealed import has_seal
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary
 
@@ -27,7 +28,8 @@ Array = NDArray[np.float64]
 def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:
     """Read plans from a file that cnpgen or anybody else has written.
 
-    Names, shapes and types must be right. Values need not be: every plan is judged for itself, later.
+    Names, shapes and types must be right. Values need not be: every plan is judged for itself, later. The checksum that
+    cnpgen writes is compared; files of others have none, and ``sealed`` of the plans says which it was.
 
     Args:
         path: The file.
@@ -45,6 +47,7 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
     require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
     if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
         raise DatasetError(f"{path} is {kind}, not a file of plans")
+    sealed = has_seal(path, kind=FORMAT, version=FORMAT_VERSION)
     with opened_hdf5(path) as file:
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
@@ -54,7 +57,7 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
         plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
         raise DatasetError(f"{path}: {error}") from error
-    return settle_tips(plans, where=f"{path}: ")
+    return settle_tips(replace(plans, sealed=sealed), where=f"{path}: ")
 
 
 def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:

@@ -42,6 +42,7 @@ class Plans:
         status: What is known of every plan, values of ``PlanStatus``, shape (N,).
         source: Where they are from, a line of text, or nothing.
         refined_with: The options that they were refined with, as JSON, or nothing.
+        sealed: Whether they are from a file with a checksum, which was right.
     """
 
     problem: ProblemRecord
@@ -54,6 +55,7 @@ class Plans:
     status: NDArray[np.uint8]
     source: str = ""
     refined_with: str = ""
+    sealed: bool = False
 
     def __post_init__(self) -> None:
         integer("degree", self.degree, least=3, most=MOST_DEGREE)

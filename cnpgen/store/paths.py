@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.files.kind import HDF5, own_kind
+from cnpgen.store.files.kind import HDF5, PLANS, own_kind
 from cnpgen.store.workspace import is_dataset
 
-PLANS = "a file of plans"
 _SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 
 

@@ -37,7 +37,9 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.plans import refine_plans
+from cnpgen.store.files.sealed import under_seal
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
+from tests.examples.plan_files import unsealed
 
 DOCS = Path(__file__).parents[2] / "docs" / "plan-format.md"
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
@@ -329,7 +331,7 @@ def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
 
 def test_a_changed_problem_is_said(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
-    with h5py.File(tmp_path / "plan.h5", "a") as file:
+    with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:
         file.attrs["problem_recipe"] = RECORD.recipe.replace('"velocity_scale": 0.8', '"velocity_scale": 0.9')
     with pytest.raises(DatasetError, match="its problem was changed after it was written"):
         load_plans(tmp_path / "plan.h5")
@@ -391,7 +393,7 @@ def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:.* puts the tip:RuntimeWarning")
 def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans(columns={"x": np.ones(N)}))
-    content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
+    content, path, draws = unsealed(tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
     for length in [*range(0, len(content), len(content) // 40), len(content) - 1]:
         path.write_bytes(content[:length])
         with pytest.raises(DatasetError, match=r"broken\.h5"):
@@ -411,6 +413,48 @@ def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp
     assert outcomes[False] > 20
 
 
+def test_a_changed_bit_anywhere_in_a_sealed_file_is_noticed(tmp_path: Path) -> None:
+    plans = draw_plans()
+    save_plans(tmp_path / "plan.h5", plans)
+    content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(1)
+    word = len("cnpgen-plans ")
+    for place in [*range(word, 100), *(draws.randrange(word, len(content)) for _ in range(300)), len(content) - 1]:
+        changed = bytearray(content)
+        changed[place] ^= 1 << draws.randrange(8)
+        path.write_bytes(changed)
+        with pytest.raises(DatasetError, match=r"broken\.h5"):
+            load_plans(path)
+    for place in range(word):  # what does not begin as a sealed file does is none, and nothing else has changed
+        path.write_bytes(content[:place] + b"?" + content[place + 1 :])
+        found = load_plans(path)
+        assert not found.sealed
+        assert_equal(found, plans)
+
+
+def test_the_reader_says_whether_a_file_has_a_checksum(tmp_path: Path) -> None:
+    plans = draw_plans()
+    save_plans(tmp_path / "plan.h5", plans)
+    found = load_plans(tmp_path / "plan.h5")
+    assert found.sealed
+    assert found[:2].sealed
+    assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "right"
+    assert not plans.sealed
+    with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:
+        file["loss"] = np.arange(float(N))
+    found = load_plans(tmp_path / "plan.h5")
+    assert not found.sealed
+    assert found.columns["loss"].tolist() == list(range(N))
+    assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "none"
+
+
+def test_a_file_of_a_newer_format_asks_for_an_upgrade(tmp_path: Path) -> None:
+    save_plans(tmp_path / "plan.h5", draw_plans())
+    content = (tmp_path / "plan.h5").read_bytes()
+    (tmp_path / "plan.h5").write_bytes(under_seal(content, kind="cnpgen-plans", version=2))
+    with pytest.raises(DatasetError, match=r"plan\.h5 has format version 2, this cnpgen reads up to 1: upgrade"):
+        load_plans(tmp_path / "plan.h5")
+
+
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
@@ -422,6 +466,7 @@ def garbage() -> Plans:
     rate[4], rate[5, 7], rate[6] = -1.0, -50.0, 0.0
     boundary.goal_dq[7, 0] = np.nan
     rate[8] = 1e-320  # positive, but 1 / r is not a number that can be had
+    rate[4, 7] = -1e308  # finite, but its differences are not
     return make_plans(AIRHOCKEY, boundary, path_control_points=path, rate_control_points=rate)
 
 

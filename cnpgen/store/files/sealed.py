@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files.atomic import read_file, write_file
+from cnpgen.store.files.atomic import machine_error, read_file, write_file
 from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
-from cnpgen.store.files.kind import seeming
+from cnpgen.store.files.kind import kind_name, seeming
 
 BLOCK = 512  # bytes of the seal
 _SEAL = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")
@@ -78,31 +78,44 @@ def under_seal(content: bytes, *, kind: str, version: int) -> bytes:
     return head.encode().ljust(BLOCK, b"\0") + body
 
 
-def check_seal(path: Path, data: bytes, *, kind: str, version: int) -> None:
-    """Refuse a file whose seal is not the right one.
+def has_seal(path: Path, *, kind: str, version: int) -> bool:
+    """Whether a file of a kind that need not be sealed is; a seal that is there must be the right one.
 
     Args:
-        path: The file, for messages.
-        data: Its bytes.
-        kind: What it must be.
+        path: The file.
+        kind: What it would be under a seal.
         version: The newest version of its format that the caller understands.
 
     Raises:
-        DatasetError: It is of another kind, cut off, damaged, or from a newer cnpgen.
+        DatasetError: It is cut off, damaged, or from a newer cnpgen.
+        MachineError: The system would not let us read it.
     """
-    head = _SEAL.match(data[:BLOCK])
-    what = kind.removeprefix("cnpgen-")
+    try:
+        with path.open("rb") as file:
+            block = file.read(BLOCK)
+            if not block.startswith(f"{kind} ".encode()):
+                return False
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise machine_error("read", path, error) from error
+    _check_seal(path, block, digest, kind=kind, version=version)
+    return True
+
+
+def _check_seal(path: Path, block: bytes, digest: str, *, kind: str, version: int) -> None:
+    """Refuse a file whose first block is not the right seal for the sha256 of what follows."""
+    head, what = _SEAL.match(block), kind_name(kind.removeprefix("cnpgen-"))
     if head is None:
-        raise DatasetError(f"{path} is not a {what} of cnpgen, or its beginning is damaged{seeming(path)}")
+        raise DatasetError(f"{path} is not {what}, or its beginning is damaged{seeming(path)}")
     if head[1].decode() != kind:
-        raise DatasetError(f"{path} is a {head[1].decode().removeprefix('cnpgen-')} of cnpgen, not a {what}")
+        raise DatasetError(f"{path} is {kind_name(head[1].decode().removeprefix('cnpgen-'))}, not {what}")
     if int(head[2]) > version:
         raise DatasetError(
             f"{path} has format version {int(head[2])}, this cnpgen reads up to {version}: upgrade cnpgen"
         )
-    if int(head[2]) < 1 or data[:BLOCK] != head[0].ljust(BLOCK, b"\0"):
+    if int(head[2]) < 1 or block != head[0].ljust(BLOCK, b"\0"):
         raise DatasetError(f"{path} is damaged: its first {BLOCK} bytes are not as they were written")
-    if hashlib.sha256(data[BLOCK:]).hexdigest().encode() != head[3]:
+    if digest.encode() != head[3]:
         raise DatasetError(f"{path} is damaged or cut off: its sha256 is not the one it was written with")
 
 
@@ -119,7 +132,7 @@ def read_sealed(path: Path, *, kind: str, version: int) -> Content:
         MachineError: The system would not let us read it.
     """
     data = read_file(path)
-    check_seal(path, data, kind=kind, version=version)
+    _check_seal(path, data[:BLOCK], hashlib.sha256(data[BLOCK:]).hexdigest(), kind=kind, version=version)
     with opened_hdf5(path, data) as file:
         values = {name: item.read() for name, item in file.columns().items()}
     try:
