@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load import load_problem_behind, restore_problem
 from cnpgen.problems.problem import Problem, resolved
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import parse
 from cnpgen.store.blueprint import StoredProblem
@@ -74,7 +74,7 @@ class ProblemRecord(StoredProblem):
     @property
     def held_joints(self) -> dict[str, float]:
         """Joints of the URDF that move and are not planned -> where they stay [rad or m]: at zero."""
-        joints = ElementTree.fromstring(self.urdf.encode()).iter("joint")  # noqa: S314 - expat expands no external entity
+        joints = urdf_tree(self.urdf).iter("joint")
         moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
         return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
 
@@ -129,7 +129,7 @@ class ProblemRecord(StoredProblem):
 
         _, robot = open_problem(self)
         model = robot.model
-        data, frame = model.createData(), model.getFrameId(robot.tip)
+        data, frame = model.createData(), robot.tip_frame
         found = np.empty((len(q), 3))
         for row, configuration in enumerate(q):
             pin.forwardKinematics(model, data, configuration)

@@ -86,13 +86,21 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     if not model.existFrame(tip):
         known = [frame.name for frame in model.frames]
         raise RecipeError([f"robot.tip: {model.name} has no frame {tip!r}{nearest(tip, known)}"])
-    frame = model.frames[model.getFrameId(tip)]
+    frame = model.frames[frame_of(model, tip)]
     if frame.parentJoint != model.njoints - 1:
         raise RecipeError([f"robot.tip: frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
     joints = tuple(_joint(model, data, index) for index in range(1, model.njoints))
     return Chain(
         joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear)
     )
+
+
+def frame_of(model: "pin.Model", name: str) -> int:
+    """Return the number of a frame; where a link and a joint have the same name, that of the link."""
+    import pinocchio as pin
+
+    body = pin.FrameType.BODY
+    return int(model.getFrameId(name, body) if model.existFrame(name, body) else model.getFrameId(name))
 
 
 def _kind(name: str) -> str:
