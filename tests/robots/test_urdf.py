@@ -12,7 +12,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import open_problem, record_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.robots.urdf import MOST_BYTES, MOST_DEPTH, urdf_tree
+from cnpgen.robots.urdf import MOST_BYTES, MOST_DEPTH, read_urdf, urdf_tree
 from cnpgen.world.state import World
 
 SHIPPED = load_problem("heavy-object")
@@ -96,8 +96,10 @@ def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
         os.mkfifo(tmp_path / "robot.urdf")
     elif what == "folder":
         (tmp_path / "robot.urdf").mkdir()
-    with pytest.raises(RecipeError, match=rf"robot.urdf: {'no such file' if what == 'nothing' else 'not a file'}"):
+    with pytest.raises(RecipeError, match=r"robot.urdf: no such file: .*robot.urdf"):
         load(path)
+    with pytest.raises(RecipeError, match=rf"robot.urdf: {'no such file' if what == 'nothing' else 'not a file'}"):
+        read_urdf(tmp_path / "robot.urdf")
 
 
 def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
