@@ -44,7 +44,7 @@ def test_a_file_that_would_take_long_is_refused_at_once(tmp_path: Path, text: st
 
 def test_texts_with_many_points_are_texts(tmp_path: Path) -> None:
     path = tmp_path / "recipe.toml"
-    path.write_text(f'title = "Well {"." * 100} {"a. " * 50}"\nx.y.z = 1\n')
+    path.write_text(f'title = "Well {"." * 100} {"a. " * 10}"\nx.y.z = 1\n')
     assert read_table(path, ("dataset",), []) is not None
 
 
