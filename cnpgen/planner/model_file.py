@@ -131,8 +131,7 @@ def _assembled(content: Content) -> Model:
     description, training = (parse_json(content.texts[name]) for name in ("description", "training"))
     check_form(description, _FORM)
     check_form(training, {EVERY: ANYTHING})
-    for key in training.keys() & _TRAINING.keys():
-        check_form(training[key], _TRAINING[key], key)
+    check_form(training, {key: form for key, form in _TRAINING.items() if key in training})
     problem = ProblemRecord(content.texts["problem_recipe"], content.texts["problem_urdf"])
     architecture = Architecture(**description["architecture"])
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])

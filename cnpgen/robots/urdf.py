@@ -1,6 +1,7 @@
 """URDF files: read as UTF-8 text, and looked at before Pinocchio, which trusts them, reads them."""
 
 import math
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,6 +10,7 @@ from cnpgen.errors import RecipeError
 MOST_BYTES = 1 << 23
 MOST_PARTS = 1_000  # links, and joints: Pinocchio descends a chain by recursion, and of 5,000 does not come back
 MOST_DEPTH = 64  # elements in one another
+_CONTROL = re.compile("[\x7f-\x9f]")  # those below are no XML
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -22,6 +24,9 @@ class _Builder(ElementTree.TreeBuilder):
         self._depth += 1
         if self._depth > MOST_DEPTH:
             raise ValueError(f"it has more than {MOST_DEPTH} elements in one another")
+        for name, value in attrs.items():
+            if _CONTROL.search(value):  # parsers print names as they are
+                raise ValueError(f"its <{tag} {name}=...> has control characters")
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> ElementTree.Element:

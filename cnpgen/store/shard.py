@@ -211,12 +211,16 @@ class Placement:
     offset: int | None
 
 
-def read_placements(path: Path) -> dict[str, Placement]:
-    """Read where a shard keeps its fields, so that they can be mapped into memory.
+def read_placements(path: Path) -> tuple[dict[str, Placement], dict[str, int]]:
+    """Read where a shard keeps its fields, so that they can be mapped into memory, and which shard it is.
+
+    Returns:
+        Field name -> its place; and the file's attributes ``plan_key``, ``first_sample_id`` and ``rows``.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off.
         MachineError: The system would not let us read it.
     """
     with opened_hdf5(path) as file:
-        return {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}
+        places = {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}
+        return places, {name: int(file.attributes[name]) for name in ("plan_key", "first_sample_id", "rows")}

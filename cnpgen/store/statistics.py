@@ -113,7 +113,7 @@ def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
     arrays |= {name + "imum": np.array(content[name], np.float64) for name in ("min", "max")}
     counts = None
     if (histogram := content.get("histogram")) is not None:
-        check_form(histogram, _HISTOGRAM_FORM, "histogram")
+        check_form(histogram, _HISTOGRAM_FORM)
         arrays |= {name: np.array(histogram[name], np.float64) for name in ("low", "high")}
         counts = np.array(histogram["counts"], np.int64)
     found = FieldStatistics(count=int(content["count"]), histogram=counts, **arrays)

@@ -136,7 +136,7 @@ def test_what_is_not_asked_for_does_not_matter(tmp_path: Path) -> None:
         assert "note" in file
         assert file["start_q"].read().shape == (3, 6)
         assert "group" not in set(file)
-        with pytest.raises(DatasetError, match="group must be a dataset, got group"):
+        with pytest.raises(DatasetError, match="group must be a dataset, got a group"):
             file["group"]
 
 

@@ -22,6 +22,7 @@ from cnpgen.store.files.limits import DOCUMENT_BYTES, DOCUMENT_DEPTH
 SHOWN = 80  # characters of two values that a message still shows
 _BLANK = "0" * 64
 _SCALARS = frozenset({int, bool, str, type(None)})  # types that are JSON's own, whatever the value
+_NESTED = frozenset({dict, list})
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # of half a character, which needs another half
 _SEAL = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
 
@@ -169,8 +170,9 @@ def _check_depth(value: Any) -> None:
     for _ in range(DOCUMENT_DEPTH + 1):
         if not level:
             return
-        items = (item for each in level for item in (each.values() if isinstance(each, dict) else each))
-        level = [item for item in items if isinstance(item, dict | list)]
+        inside = (each.values() if isinstance(each, dict) else each for each in level)
+        level = [item for items in inside if not _NESTED.isdisjoint(map(type, items)) for item in items]
+        level = [item for item in level if isinstance(item, dict | list)]
     raise _too_deep()
 
 

@@ -17,6 +17,8 @@ from typing import Any
 Form = Any
 EVERY = "*"
 LARGEST = 2**63 - 1
+_MISSING = object()
+_NOT_FINITE = ("inf", "-inf", "nan")
 
 
 class Leaf(Enum):
@@ -38,52 +40,83 @@ class Maybe:
     form: Form
 
 
-def check_form(value: Any, form: Form, where: str = "") -> None:
+class FormError(ValueError):
+    """A value that has another form.
+
+    Args:
+        text: What was expected and what is there.
+
+    Attributes:
+        where: Keys that lead to the value, the last one first: each level adds its own.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.where: list[str] = []
+
+    def __str__(self) -> str:
+        return f"{''.join(reversed(self.where)).lstrip('.') or 'the document'} {self.args[0]}"
+
+
+def check_form(value: Any, form: Form) -> None:
     """Refuse a value that has another form.
 
     Args:
         value: What ``json.loads`` returned.
         form: The form.
-        where: Dotted key of the value: ``"splits.train"``.
 
     Raises:
-        ValueError: It has; the message says where, what was expected and what is there.
+        FormError: It has; the message says where, what was expected and what is there.
     """
-    if isinstance(form, Maybe):
-        if value is not None:
-            check_form(value, form.form, where)
-    elif isinstance(form, Leaf):
+    if isinstance(form, Leaf):
         if not _is(value, form):
-            raise _wrong(where, form.value, value)
+            raise _wrong(form.value, value)
     elif isinstance(form, list):
-        _check_list(value, form[0], where)
+        _check_list(value, form[0])
+    elif isinstance(form, Maybe):
+        if value is not None:
+            check_form(value, form.form)
     else:
-        _check_table(value, form, where)
+        _check_table(value, form)
 
 
-def _check_list(value: Any, form: Form, where: str) -> None:
+def _check_list(value: Any, form: Form) -> None:
     if not isinstance(value, list):
-        raise _wrong(where, "a list", value)
-    for index, item in enumerate(value):
-        check_form(item, form, f"{where}[{index}]")
-
-
-def _check_table(value: Any, form: Mapping[str, Form], where: str) -> None:
-    if not isinstance(value, dict):
-        raise _wrong(where, "a table", value)
-    if EVERY in form:
-        for key, item in value.items():
-            check_form(item, form[EVERY], _joined(where, key))
+        raise _wrong("a list", value)
+    if isinstance(form, Leaf) and _are(value, form):
         return
-    for key, expected in form.items():
-        if key not in value:
-            raise ValueError(f"{_joined(where, key)} is missing")
-        check_form(value[key], expected, _joined(where, key))
+    for index, item in enumerate(value):
+        try:
+            check_form(item, form)
+        except FormError as error:
+            error.where.append(f"[{index}]")
+            raise
+
+
+def _check_table(value: Any, form: Mapping[str, Form]) -> None:
+    if not isinstance(value, dict):
+        raise _wrong("a table", value)
+    every = form.get(EVERY)
+    for key in value if every else form:
+        try:
+            check_form(value.get(key, _MISSING), every or form[key])
+        except FormError as error:
+            error.where.append(f".{key}")
+            raise
+
+
+def _are(values: list[Any], leaf: Leaf) -> bool:
+    """Whether all values are plainly so; where not, each is looked at: histograms are thousands of counts."""
+    kinds = set(map(type, values))
+    if kinds == {int}:
+        low = 0 if leaf is WHOLE else -LARGEST
+        return leaf in {WHOLE, NUMBER} and low <= min(values) and max(values) <= LARGEST
+    return (leaf is NUMBER and kinds == {float}) or (leaf is TEXT and kinds == {str})
 
 
 def _is(value: Any, leaf: Leaf) -> bool:
     if leaf is ANYTHING:
-        return True
+        return value is not _MISSING
     if leaf is TEXT:
         return isinstance(value, str)
     if isinstance(value, bool):
@@ -92,13 +125,11 @@ def _is(value: Any, leaf: Leaf) -> bool:
         return isinstance(value, int) and 0 <= value <= LARGEST
     if isinstance(value, int):
         return abs(value) <= LARGEST
-    return isinstance(value, float) or value in {"inf", "-inf", "nan"}
+    return isinstance(value, float) or (isinstance(value, str) and value in _NOT_FINITE)
 
 
-def _joined(where: str, key: str) -> str:
-    return f"{where}.{key}" if where else key
-
-
-def _wrong(where: str, expected: str, value: Any) -> ValueError:
+def _wrong(expected: str, value: Any) -> FormError:
+    if value is _MISSING:
+        return FormError("is missing")
     shown = f"a list of {len(value)}" if isinstance(value, list) else "a table" if isinstance(value, dict) else ""
-    return ValueError(f"{where or 'the document'} must be {expected}, got {shown or f'{value!r:.60}'}")
+    return FormError(f"must be {expected}, got {shown or f'{value!r:.60}'}")

@@ -50,6 +50,62 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
 
 
 @dataclass(frozen=True, eq=False)
+class Attributes:
+    """What is attached to a file or to a dataset: texts, numbers, short lists of numbers."""
+
+    path: Path
+    _item: Any  # an identifier of h5py's lower interface
+
+    def __iter__(self) -> Iterator[str]:
+        from h5py import h5a
+
+        if (count := h5a.get_num_attrs(self._item)) > MOST_NAMES:
+            raise DatasetError(f"{self.path} has {count:,} attributes, expected at most {MOST_NAMES:,}")
+        names: list[bytes] = []
+        h5a.iterate(self._item, names.append)
+        return (_decoded(self.path, name) for name in names)
+
+    def __contains__(self, name: str) -> bool:
+        from h5py import h5a
+
+        return bool(h5a.exists(self._item, name.encode()))
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a text, a number or an array of numbers.
+
+        Raises:
+            DatasetError: It is something else, or too large.
+        """
+        from h5py import AttributeManager, h5a, h5s, h5t
+
+        found = h5a.open(self._item, name.encode())
+        kind, space = found.get_type(), found.get_space()
+        text, count = kind.get_class() == h5t.STRING, space.get_simple_extent_npoints()
+        scalar = space.get_simple_extent_type() == h5s.SCALAR
+        plain = scalar if text else kind.get_class() in {h5t.INTEGER, h5t.FLOAT} and count > 0
+        if not plain:
+            raise DatasetError(f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers")
+        if count * kind.get_size() > MOST_ATTRIBUTE_BYTES:
+            raise DatasetError(f"{self.path}: the attribute {name!r} is larger than {MOST_ATTRIBUTE_BYTES:,} bytes")
+        return AttributeManager(_Parent(self._item))[name]
+
+    def some(self, names: Iterable[str]) -> dict[str, Any]:
+        """Return those of some names that are there."""
+        return {name: self[name] for name in names if name in self}
+
+    def all(self) -> dict[str, Any]:
+        """Return everything."""
+        return {name: self[name] for name in self}
+
+
+@dataclass(frozen=True)
+class _Parent:
+    """What h5py wants to know of the owner of attributes."""
+
+    id: Any
+
+
+@dataclass(frozen=True, eq=False)
 class Column:
     """A dataset of plain numbers.
 
@@ -63,56 +119,19 @@ class Column:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     offset: int | None
-    attributes: "Attributes"
+    attributes: Attributes
     _dataset: Any
+
+    @property
+    def bytes(self) -> int:
+        """How much memory its numbers take."""
+        return math.prod(self.shape) * self.dtype.itemsize
 
     def read(self) -> NDArray[Any]:
         """Return its numbers."""
-        return np.asarray(self._dataset[()])
+        from h5py import Dataset
 
-
-@dataclass(frozen=True, eq=False)
-class Attributes:
-    """What is attached to a file or to a dataset: texts, numbers, short lists of numbers."""
-
-    path: Path
-    _item: Any
-
-    def __iter__(self) -> Iterator[str]:
-        names = list(self._item.attrs)
-        if len(names) > MOST_NAMES:
-            raise DatasetError(f"{self.path} has {len(names):,} attributes, expected at most {MOST_NAMES:,}")
-        return iter(names)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._item.attrs
-
-    def __getitem__(self, name: str) -> Any:
-        """Return a text, a number or an array of numbers.
-
-        Raises:
-            DatasetError: It is something else, or too large.
-        """
-        from h5py import h5a, h5s, h5t
-
-        found = h5a.open(self._item.id, _encoded(self.path, name))
-        kind, space = found.get_type(), found.get_space()
-        text, count = kind.get_class() == h5t.STRING, space.get_simple_extent_npoints()
-        scalar = space.get_simple_extent_type() == h5s.SCALAR
-        plain = scalar if text else kind.get_class() in {h5t.INTEGER, h5t.FLOAT} and count > 0
-        if not plain:
-            raise DatasetError(f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers")
-        if count * kind.get_size() > MOST_ATTRIBUTE_BYTES:
-            raise DatasetError(f"{self.path}: the attribute {name!r} is larger than {MOST_ATTRIBUTE_BYTES:,} bytes")
-        return self._item.attrs[name]
-
-    def some(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return those of some names that are there."""
-        return {name: self[name] for name in names if name in self}
-
-    def all(self) -> dict[str, Any]:
-        """Return everything."""
-        return {name: self[name] for name in self}
+        return np.asarray(Dataset(self._dataset)[()])
 
 
 @dataclass(eq=False)
@@ -126,18 +145,22 @@ class Hdf5:
 
     path: Path
     attributes: Attributes
-    _file: Any
+    _root: Any  # an identifier of h5py's lower interface
     _size: int
     _given: dict[str, Column] = field(default_factory=dict)
+    _opened: dict[str, Any] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[str]:
         """Yield the names of what is not a group, whether it can be given or not."""
-        if len(self._file) > MOST_NAMES:
-            raise DatasetError(f"{self.path} has {len(self._file):,} datasets, expected at most {MOST_NAMES:,}")
-        return (name for name in self._file if not self._is_group(name))
+        from h5py import h5g
 
-    def __contains__(self, name: object) -> bool:
-        return name in set(self._file)
+        if (count := len(self._root)) > MOST_NAMES:
+            raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MOST_NAMES:,}")
+        names = [_decoded(self.path, name) for name in self._root]
+        return (name for name in names if not isinstance(self._open(name), h5g.GroupID))
+
+    def __contains__(self, name: str) -> bool:
+        return name.encode() in self._root
 
     def __getitem__(self, name: str) -> Column:
         """Return a dataset without reading its numbers.
@@ -147,35 +170,33 @@ class Hdf5:
                 can be true.
         """
         if name not in self._given:
-            if not self._is_hard(name):
-                raise DatasetError(f"{self.path} is damaged: its {name!r} is a link, and links are not followed")
-            self._given[name] = self._checked(name, self._file[name])
+            self._given[name] = self._checked(name, self._open(name))
         return self._given[name]
 
     def columns(self) -> Mapping[str, Column]:
         """Return every dataset; see ``__getitem__``."""
         return {name: self[name] for name in self}
 
-    def _is_hard(self, name: str) -> bool:
-        from h5py import h5l
+    def _open(self, name: str) -> Any:
+        """Open what is in the file under a name."""
+        from h5py import h5l, h5o
 
-        return bool(self._file.id.links.get_info(_encoded(self.path, name)).type == h5l.TYPE_HARD)
-
-    def _is_group(self, name: str) -> bool:
-        from h5py import Group
-
-        return self._is_hard(name) and self._file.get(name, getclass=True) is Group
+        if name not in self._opened:
+            if self._root.links.get_info(name.encode()).type != h5l.TYPE_HARD:
+                raise DatasetError(f"{self.path} is damaged: its {name!r} is a link, and links are not followed")
+            self._opened[name] = h5o.open(self._root, name.encode())
+        return self._opened[name]
 
     def _checked(self, name: str, dataset: Any) -> Column:
         """Look at a dataset in an order in which nothing is believed, or opened, before it is known to be plain."""
-        from h5py import Dataset, h5d, h5t
+        from h5py import h5d, h5t
 
-        if not isinstance(dataset, Dataset):
-            raise DatasetError(f"{self.path}: {name} must be a dataset, got {type(dataset).__name__.lower()}")
-        layout = dataset.id.get_create_plist()
+        if not isinstance(dataset, h5d.DatasetID):
+            raise DatasetError(f"{self.path}: {name} must be a dataset, got a group or a type")
+        layout = dataset.get_create_plist()
         if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
             raise DatasetError(f"{self.path}: the numbers of {name} are in another file, where they are not looked for")
-        if dataset.id.get_type().get_class() not in {h5t.INTEGER, h5t.FLOAT}:
+        if dataset.get_type().get_class() not in {h5t.INTEGER, h5t.FLOAT}:
             raise DatasetError(f"{self.path}: {name} must hold numbers, got {_type_text(dataset)}")
         filters = [layout.get_filter(index)[0] for index in range(layout.get_nfilters())]
         if not _FILTERS.keys() >= set(filters):
@@ -184,29 +205,28 @@ class Hdf5:
         shape = dataset.shape
         if shape is None or len(shape) > MOST_DIMENSIONS:
             raise DatasetError(f"{self.path}: {name} must have at most {MOST_DIMENSIONS} dimensions, got {shape}")
-        chunk = layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else ()
-        self._check_size(name, shape, chunk, dataset.dtype.itemsize)
-        offset = dataset.id.get_offset()
-        if offset is not None and offset + math.prod(shape) * dataset.dtype.itemsize > self._size:
-            raise DatasetError(f"{self.path} is damaged or cut off: {name} reaches beyond its end")
-        return Column(shape, dataset.dtype, offset, Attributes(self.path, dataset), dataset)
+        found = Column(shape, dataset.dtype, dataset.get_offset(), Attributes(self.path, dataset), dataset)
+        self._check_size(name, found, layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else ())
+        return found
 
-    def _check_size(self, name: str, shape: tuple[int, ...], chunk: tuple[int, ...], itemsize: int) -> None:
+    def _check_size(self, name: str, found: Column, chunk: tuple[int, ...]) -> None:
         """Refuse more numbers than a file of this size can honestly hold, together with those given before."""
-        before = sum(math.prod(item.shape) * item.dtype.itemsize for item in self._given.values())
-        declared = max(before + math.prod(shape) * itemsize, math.prod(chunk) * itemsize)
+        before = sum(item.bytes for item in self._given.values())
+        declared = max(before + found.bytes, math.prod(chunk) * found.dtype.itemsize)
         if declared > max(EXPANSION * self._size, ALWAYS):
             raise DatasetError(
-                f"{self.path}: {name} declares the shape {shape}: unpacked, the file of {self._size:,} bytes would have"
-                f" {declared:,}, more than {EXPANSION} times as many"
+                f"{self.path}: {name} declares the shape {found.shape}: unpacked, the file of {self._size:,} bytes"
+                f" would have {declared:,}, more than {EXPANSION} times as many"
             )
+        if found.offset is not None and found.offset + found.bytes > self._size:
+            raise DatasetError(f"{self.path} is damaged or cut off: {name} reaches beyond its end")
 
 
-def _encoded(path: Path, name: str | bytes) -> bytes:
-    """Return a name as the file has it; h5py gives those that are no texts as bytes."""
-    if isinstance(name, bytes):
-        raise DatasetError(f"{path} is damaged: it has the name {name!r}, which is not UTF-8")
-    return name.encode()
+def _decoded(path: Path, name: bytes) -> str:
+    try:
+        return name.decode()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is damaged: it has the name {name!r}, which is not UTF-8") from error
 
 
 def _type_text(dataset: Any) -> str:
@@ -237,7 +257,7 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         size = _check_bytes(path, content)
         source: Any = path if content is None else io.BytesIO(content)
         with h5py.File(source, "r", locking="best-effort" if content is None else None) as file:
-            yield Hdf5(path, Attributes(path, file), file, size)
+            yield Hdf5(path, Attributes(path, file.id), file.id, size)
     except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
