@@ -1,4 +1,4 @@
-"""A thousandth of what ``python -m tests.faults`` does: changed files of every kind end in a result or a CnpgenError."""
+"""A thousandth of what ``python -m tests.faults`` does: changed files of every kind give results or CnpgenErrors."""
 
 import pytest
 
