@@ -20,6 +20,7 @@ def main() -> int:
         seed=arguments.seed,
         first=arguments.first,
         kinds=tuple(arguments.kind or SUBJECTS),
+        progress=lambda done: print(f"{done:,} inputs", flush=True) if done % 1000 == 0 else None,
     )
     for kind in SUBJECTS:
         print(f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused")

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,7 +41,14 @@ class Outcome:
     findings: list[str] = field(default_factory=list)
 
 
-def fuzz(inputs: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = tuple(SUBJECTS)) -> Outcome:
+def fuzz(
+    inputs: int,
+    *,
+    seed: int = 0,
+    first: int = 0,
+    kinds: tuple[str, ...] = tuple(SUBJECTS),
+    progress: Callable[[int], None] | None = None,
+) -> Outcome:
     """Make changed files of all kinds in turn and read them.
 
     Args:
@@ -49,6 +56,7 @@ def fuzz(inputs: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] =
         seed: Seed; every input is a function of it, its number and its kind.
         first: Number of the first input.
         kinds: Which kinds.
+        progress: Called after every input with their number so far.
     """
     outcome = Outcome()
     with tempfile.TemporaryDirectory(prefix="cnpgen-faults-") as temporary:
@@ -58,6 +66,8 @@ def fuzz(inputs: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] =
         with _limited():
             for number in range(first, first + inputs):
                 _try(number, seed, kinds[number % len(kinds)], good, Path(temporary) / "given", outcome)
+                if progress is not None:
+                    progress(number + 1 - first)
     return outcome
 
 

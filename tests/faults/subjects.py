@@ -330,7 +330,14 @@ def _read_checkpoint(folder: Path, draw: Random) -> None:
 
 
 def _change_journal(good: Path, folder: Path, draw: Random) -> None:
-    (folder / "journal").write_bytes(change_bytes((good / "journal").read_bytes(), draw))
+    content = (good / "journal").read_bytes()
+    if draw.random() < 0.3:
+        (folder / "journal").write_bytes(change_bytes(content, draw))
+        return
+    begin = content.index(json.dumps(IDENTITY).encode()) + len(json.dumps(IDENTITY))  # of the frame of a plan
+    payload = change_bytes(content[begin + 40 :], draw)
+    head = len(payload).to_bytes(8, "little") + hashlib.sha256(payload).digest()
+    (folder / "journal").write_bytes(content[:begin] + head + payload)
 
 
 def _read_journal(folder: Path, draw: Random) -> None:
