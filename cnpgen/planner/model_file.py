@@ -137,7 +137,7 @@ def _assembled(content: Content) -> Model:
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
     meaning = Meaning(**description["meaning"])
     _check_sizes(problem, architecture, features)
-    if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(meaning.path_scale):
+    if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
         raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
     return Model(
         problem=problem,
