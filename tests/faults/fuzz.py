@@ -16,7 +16,8 @@ from random import Random
 from types import FrameType
 
 from cnpgen.errors import CnpgenError
-from tests.faults.subjects import SUBJECTS, Subject, make_good_files, read_quietly
+from tests.faults.good_files import make_good_files
+from tests.faults.subjects import SUBJECTS, Subject, read_quietly
 
 SECONDS, BYTES = 10, 2 << 30  # what reading one file may take
 STUCK = 60  # [s] after which the process itself is ended: something hangs that no signal interrupts

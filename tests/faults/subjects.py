@@ -1,4 +1,4 @@
-"""The kinds of files that strangers send: a good one of each, how it is changed under a right seal, how it is read."""
+"""The kinds of files that strangers send: how a good one is changed, mostly under a right seal, and how it is read."""
 
 import hashlib
 import json
@@ -6,7 +6,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -18,34 +18,26 @@ import numpy as np
 from cnpgen.cli.inspect_command import inspection_text
 from cnpgen.errors import CnpgenError
 from cnpgen.loader.load import load_dataset
-from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
-from cnpgen.planner.model_file import load_model, save_model
+from cnpgen.planner.model_file import load_model
 from cnpgen.plans.boundary_file import read_boundary_file
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.load import load_plans
 from cnpgen.plans.plans import screen
-from cnpgen.plans.save import save_plans
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.record import open_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.journal import open_journal
-from cnpgen.refine.task import Outcome, Refined
-from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.blueprint import from_json
 from cnpgen.store.files.documents import canonical_sha256, save_document
 from cnpgen.store.files.sealed import BLOCK, Content, read_sealed, seal, under_seal
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.shard import read_schema, read_shard
 from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.training.state import start_state
 from cnpgen.validate.dataset import validate_dataset
-from tests.examples.models import boundary_of_columns, untrained_model
-from tests.examples.plan_files import plans_of, unsealed
-from tests.examples.plans import load as stored_plan
+from tests.faults.good_files import IDENTITY
 from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf
 
-IDENTITY = {"steps": 10}
 DOCUMENTS = ("plan.json", "manifest.json", "stats.json", "train/shard-00000.json", "validation/shard-00000.json")
 
 
@@ -60,34 +52,6 @@ class Subject:
 
     change: Callable[[Path, Path, Random], None]
     read: Callable[[Path, Random], None]
-
-
-def make_good_files(folder: Path) -> None:
-    """Make a good file of every kind, once."""
-    tiny = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24, "validation": 8})
-    make_dataset(tiny, folder / "set", workers=1, shard_size=24)
-    shutil.copytree(recipes_root() / "problems" / "airhockey", folder / "recipes")
-    for kind in ("pipelines", "datasets"):
-        shutil.copy(recipes_root() / kind / "airhockey-hit.toml", folder / "recipes" / f"{kind}.toml")
-    for name, old, new in (
-        ("datasets.toml", 'pipeline = "airhockey-hit"', 'pipeline = "./pipelines.toml"'),
-        ("pipelines.toml", 'problem = "airhockey"', 'problem = "./problem.toml"'),
-    ):
-        path = folder / "recipes" / name
-        path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
-    plan = stored_plan("hit")
-    save_plans(folder / "plans.h5", plans_of(plan, plan))
-    shutil.copy(folder / "plans.h5", folder / "unsealed.h5")
-    unsealed(folder / "unsealed.h5")
-    columns = read_shard(folder / "set" / "train" / "shard-00000.h5")
-    model = untrained_model("airhockey", boundary_of_columns(columns, 20))
-    save_model(folder / "model.h5", replace(model, training={"dataset": {"name": "x"}, "stages": [{"use": "y"}]}))
-    state = start_state(np.zeros(10, np.float32), terms=3, steps=10)
-    Checkpoints(folder / "checkpoint", IDENTITY).save(state)
-    journal = open_journal(folder / "journal", json.dumps(IDENTITY))
-    done = Refined(np.zeros((15, 6)), np.ones(20), Outcome.SOLVED, "ok", 3, 1.0)
-    journal.append([0], [done])
-    journal.close()
 
 
 def _change_recipe(good: Path, folder: Path, draw: Random) -> None:

@@ -8,7 +8,7 @@ is refused by name.
 import errno
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.attributes import Attributes, decoded
 from cnpgen.store.files.heaps import check_heaps
 from cnpgen.store.files.kind import seeming
-from cnpgen.store.files.limits import ALWAYS, EXPANSION, MOST_ATTRIBUTE_BYTES, MOST_DIMENSIONS, MOST_NAMES
+from cnpgen.store.files.limits import ALWAYS, EXPANSION, MOST_DIMENSIONS, MOST_NAMES
 
 _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # what h5py raises on broken files
 _SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
@@ -47,62 +48,6 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
     access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
     access.set_alignment(1, alignment)
     return h5f.create(b"buffer", h5f.ACC_TRUNC, creation, access)
-
-
-@dataclass(frozen=True, eq=False)
-class Attributes:
-    """What is attached to a file or to a dataset: texts, numbers, short lists of numbers."""
-
-    path: Path
-    _item: Any  # an identifier of h5py's lower interface
-
-    def __iter__(self) -> Iterator[str]:
-        from h5py import h5a
-
-        if (count := h5a.get_num_attrs(self._item)) > MOST_NAMES:
-            raise DatasetError(f"{self.path} has {count:,} attributes, expected at most {MOST_NAMES:,}")
-        names: list[bytes] = []
-        h5a.iterate(self._item, names.append)
-        return (_decoded(self.path, name) for name in names)
-
-    def __contains__(self, name: str) -> bool:
-        from h5py import h5a
-
-        return bool(h5a.exists(self._item, name.encode()))
-
-    def __getitem__(self, name: str) -> Any:
-        """Return a text, a number or an array of numbers.
-
-        Raises:
-            DatasetError: It is something else, or too large.
-        """
-        from h5py import AttributeManager, h5a, h5s, h5t
-
-        found = h5a.open(self._item, name.encode())
-        kind, space = found.get_type(), found.get_space()
-        text, count = kind.get_class() == h5t.STRING, space.get_simple_extent_npoints()
-        scalar = space.get_simple_extent_type() == h5s.SCALAR
-        plain = scalar if text else kind.get_class() in {h5t.INTEGER, h5t.FLOAT} and count > 0
-        if not plain:
-            raise DatasetError(f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers")
-        if count * kind.get_size() > MOST_ATTRIBUTE_BYTES:
-            raise DatasetError(f"{self.path}: the attribute {name!r} is larger than {MOST_ATTRIBUTE_BYTES:,} bytes")
-        return AttributeManager(_Parent(self._item))[name]
-
-    def some(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return those of some names that are there."""
-        return {name: self[name] for name in names if name in self}
-
-    def all(self) -> dict[str, Any]:
-        """Return everything."""
-        return {name: self[name] for name in self}
-
-
-@dataclass(frozen=True)
-class _Parent:
-    """What h5py wants to know of the owner of attributes."""
-
-    id: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +101,7 @@ class Hdf5:
 
         if (count := len(self._root)) > MOST_NAMES:
             raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MOST_NAMES:,}")
-        names = [_decoded(self.path, name) for name in self._root]
+        names = [decoded(self.path, name) for name in self._root]
         return (name for name in names if not isinstance(self._open(name), h5g.GroupID))
 
     def __contains__(self, name: str) -> bool:
@@ -220,13 +165,6 @@ class Hdf5:
             )
         if found.offset is not None and found.offset + found.bytes > self._size:
             raise DatasetError(f"{self.path} is damaged or cut off: {name} reaches beyond its end")
-
-
-def _decoded(path: Path, name: bytes) -> str:
-    try:
-        return name.decode()
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is damaged: it has the name {name!r}, which is not UTF-8") from error
 
 
 def _type_text(dataset: Any) -> str:
