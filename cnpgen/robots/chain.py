@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+LINK = " (link)"  # behind the name of a link that a joint has, too
 _PLANNED = "only revolute and prismatic joints can be planned"
 _KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
     "JointModelRUB": "a continuous joint, which has no limits (make it revolute, with limits)",
@@ -95,12 +96,19 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     )
 
 
-def frame_of(model: "pin.Model", name: str) -> int:
-    """Return the number of a frame; where a link and a joint have the same name, that of the link."""
+def tell_links_apart(model: "pin.Model") -> None:
+    """Rename the frames of links that have the name of a joint: Pinocchio looks for frames by name."""
     import pinocchio as pin
 
-    body = pin.FrameType.BODY
-    return int(model.getFrameId(name, body) if model.existFrame(name, body) else model.getFrameId(name))
+    joints = {frame.name for frame in model.frames if frame.type != pin.FrameType.BODY}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY and frame.name in joints:
+            frame.name += LINK
+
+
+def frame_of(model: "pin.Model", name: str) -> int:
+    """Return the number of a frame; where a link and a joint have the same name, that of the link."""
+    return int(model.getFrameId(name + LINK if model.existFrame(name + LINK) else name))
 
 
 def _kind(name: str) -> str:

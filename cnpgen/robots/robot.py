@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
-from cnpgen.robots.chain import Chain, frame_of
+from cnpgen.robots.chain import Chain, frame_of, tell_links_apart
 from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.urdf import urdf_tree
 
@@ -100,6 +100,7 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model"
     try:
         check_mimic(urdf_tree(text), joints)
         model = pin.buildModelFromXML(text)
+        tell_links_apart(model)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
     known = list(model.names)[1:]

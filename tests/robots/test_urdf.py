@@ -1,6 +1,7 @@
 """URDFs of strangers: what would end the process, or is no URDF, is a mistake in the recipe."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,14 +123,31 @@ def test_a_link_may_have_the_name_of_its_joint(tmp_path: Path) -> None:
     fixed = next(name for name in reversed(names) if name not in SHIPPED.robot.joints)
     problem = load(problem_with(tmp_path, shipped_with((f'<joint name="{fixed}"', f'<joint name="{last}"'))))
     robot = load_robot(problem)
-    with pytest.raises(ValueError, match="Several frames"):
-        robot.model.getFrameId(last)
     worlds = [World(each, SHIPPED.obstacle, SHIPPED.object_size) for each in (usual, robot)]
     q = np.linspace(-0.5, 0.5, 7)
     for world in worlds:
         world.set_state(q, q, q, np.zeros(2))
     np.testing.assert_array_equal(worlds[0].tip_position, worlds[1].tip_position)
     assert usual.skeleton == robot.skeleton
+
+
+def test_a_link_may_have_the_name_of_any_joint(tmp_path: Path) -> None:
+    """Of joints that are held still, too, without which Pinocchio reduces the model."""
+    shipped = load_problem("airhockey")
+    there = replace(shipped.robot, urdf="robot.urdf")
+    usual, urdf = load_robot(shipped), shipped.urdf_text
+    links = [part.split('"')[0] for part in urdf.split('<link name="')[1:]]
+    for joint in (part.split('"')[0] for part in urdf.split('<joint name="')[1:]):
+        if joint in shipped.robot.joints:
+            continue
+        for link in links:
+            text = urdf.replace(f'<joint name="{joint}"', f'<joint name="{link}"', 1)
+            problem = replace(
+                shipped, path=problem_with(tmp_path, text), robot=replace(shipped.robot, urdf="robot.urdf")
+            )
+            robot = load_robot(problem)
+            assert robot.skeleton == usual.skeleton
+            np.testing.assert_array_equal(robot.chain.tip_translation, usual.chain.tip_translation)
 
 
 def test_a_tree_as_deep_as_robots_are_is_read() -> None:
