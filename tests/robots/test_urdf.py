@@ -142,9 +142,7 @@ def test_a_link_may_have_the_name_of_any_joint(tmp_path: Path) -> None:
             continue
         for link in links:
             text = urdf.replace(f'<joint name="{joint}"', f'<joint name="{link}"', 1)
-            problem = replace(
-                shipped, path=problem_with(tmp_path, text), robot=replace(shipped.robot, urdf="robot.urdf")
-            )
+            problem = replace(shipped, path=problem_with(tmp_path, text), robot=there)
             robot = load_robot(problem)
             assert robot.skeleton == usual.skeleton
             np.testing.assert_array_equal(robot.chain.tip_translation, usual.chain.tip_translation)
