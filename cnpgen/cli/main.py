@@ -28,6 +28,7 @@ from cnpgen.cli import (
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
 from cnpgen.cli.shell import in_shell
+from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
 from cnpgen.machine.threads import prefer_one_thread
 
@@ -100,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
-    with _warnings_on_one_line():
+    with printing_safely(), _warnings_on_one_line():
         try:
             with interruptible():
                 code = _run(words, given)

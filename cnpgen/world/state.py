@@ -45,7 +45,7 @@ class World:
         self._model = robot.model
         self._data = self._model.createData()
         self._dynamics_data = self._model.createData()  # RNEA's accelerations include gravity: kept apart
-        self._tip = self._model.getFrameId(robot.tip)
+        self._tip = robot.tip_frame
         self._object_size = object_size
         self._scene = Scene(obstacles, object_size, len(robot.skeleton))
         self._skeleton = robot.skeleton
