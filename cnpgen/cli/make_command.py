@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.interruption import raise_if_interrupted
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
@@ -43,6 +43,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    add_engine(parser)
     option(
         "--shard-size",
         metavar="R",
@@ -111,6 +112,8 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
             n=arguments.n,
             seed=arguments.seed,
             workers=arguments.workers,
+            engine=arguments.engine,
+            address=arguments.address,
             shard_size=arguments.shard_size,
             dtype=arguments.dtype,
             backend=arguments.backend,

@@ -89,7 +89,7 @@ def _generated(
     order, results = "generator" if ordered else "generator_unordered", None
     run = Parallel(n_jobs=workers, return_as=order, pre_dispatch="2*n_jobs", batch_size=1, **options)
     try:
-        with _signals_held():
+        with signals_held():
             results = run(delayed(function)(task) for task in tasks)
         for result in results:  # noqa: UP028 - closing this generator must not close that one noisily
             yield result
@@ -172,7 +172,7 @@ def _shared_folder() -> Iterator[str]:
 
 
 @contextmanager
-def _signals_held() -> Iterator[None]:
+def signals_held() -> Iterator[None]:
     """Let processes be started that never see Ctrl-C, which a terminal sends to all of them.
 
     A process inherits the signals that are blocked when it is started. Only this process acts on them, at the end of

@@ -10,14 +10,13 @@ from itertools import groupby
 from pathlib import Path
 
 from cnpgen.errors import UsageError
-from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.blueprint import dataset_folder, draw_up
 from cnpgen.make.certify import certified
 from cnpgen.make.load import as_dataset_recipe, load_notes
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.shards import Job, make_shards
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
-from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import Blueprint, ShardTask, shards
 from cnpgen.store.check import check_documents
 from cnpgen.store.fates import Fates
@@ -68,6 +67,8 @@ def make_dataset(
     n: int | None = None,
     seed: int | None = None,
     workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
     shard_size: int | None = None,
     dtype: str = "float64",
     backend: str | None = None,
@@ -80,8 +81,7 @@ def make_dataset(
     """Make a dataset, or finish one that was interrupted.
 
     What is there already is compared with its recorded sha256; what is damaged is made again, after a warning.
-    Workers run on joblib: its default is one process per core; inside ``joblib.parallel_config(backend="dask")`` or
-    any other registered backend they run there.
+    Workers are processes of this machine by default, or of a cluster (docs/scale.md): the bytes are the same.
 
     Args:
         recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a loaded recipe.
@@ -89,7 +89,10 @@ def make_dataset(
         n: Rows over all splits; default the recipe's. Fewer rows are the first of each split.
         seed: Root seed; default the recipe's.
         workers: Processes; default one per available core, or one where so few rows are missing that a second would
-            not pay.
+            not pay; of a cluster as many as it has.
+        engine: "loky": processes of this machine; "dask" or "ray": a cluster, whose workers see the same folder. By
+            default loky, or the backend that ``joblib.parallel_config`` names.
+        address: Of the cluster's scheduler or head; by default a cluster on this machine, for this call.
         shard_size: Rows per shard; default between 8192 and 65536, of certified datasets between 64 and 1024.
         dtype: "float64" or "float32", what rows are stored as and validated as.
         backend: "compiled", "numpy" or "casadi"; default the fastest that works.
@@ -107,7 +110,8 @@ def make_dataset(
         MachineError: No working backend, a full disk, a dead worker; run again to go on.
         DatasetError: The plan.json in the folder is damaged.
     """
-    _check(workers, part, force=force)
+    where = Engine(engine, address, workers)
+    _check(part, force=force)
     loaded = as_dataset_recipe(recipe)
     loaded = certified(loaded) if certify else loaded
     notes = load_notes(loaded)
@@ -122,7 +126,7 @@ def make_dataset(
     if begin is not None:
         rows = sum(task.rows for task in mine)
         begin("making", folder, rows, rows - sum(task.rows for task in waiting))
-    made = _make(job, waiting, workers, progress)
+    made = _make(job, waiting, where, progress)
     complete, documents = _finish(job, notes, made=made, alone=part is None)
     rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.blueprint.splits}
     return MadeDataset(folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
@@ -156,10 +160,10 @@ def _take_stock(
     return [task for task in tasks if task not in sound], [task.file for task in damaged]
 
 
-def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progress | None) -> int:
+def _make(job: Job, tasks: list[ShardTask], engine: Engine, progress: Progress | None) -> int:
     """Make the shards; return their rows."""
     made = 0
-    with closing(_results(job, tasks, workers)) as results:
+    with closing(_results(job, tasks, engine)) as results:
         for rows, fates in results:
             made += rows
             if progress is not None:
@@ -167,18 +171,21 @@ def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progr
     return made
 
 
-def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Fates], None, None]:
+def _results(job: Job, tasks: list[ShardTask], engine: Engine) -> Generator[tuple[int, Fates], None, None]:
     """Make the shards and yield what became of them as they are committed."""
-    workers = worker_count(1 if workers is None and is_quick(job.blueprint, tasks) else workers, len(tasks))
-    groups = runs(job.blueprint, tasks, workers)
-    if workers == 1:
-        for group in groups:
-            yield from make_shards(job, group)
+    if not tasks:
         return
-    advice = f": the shards that are finished are safe in {job.folder}; {AGAIN} to go on"
-    with closing(share_out(partial(_made, job), groups, workers, advice=advice)) as results:
-        for made in results:
-            yield from made
+    with assembled(engine, len(tasks), quick=is_quick(job.blueprint, tasks)) as team:
+        groups = runs(job.blueprint, tasks, team.size)
+        if team.size == 1 and not team.is_far:
+            for group in groups:
+                yield from make_shards(job, group)
+            return
+        theirs = replace(job, folder=job.folder.absolute(), cache_folder=None) if team.is_far else job
+        advice = f": the shards that are finished are safe in {job.folder}; {AGAIN} to go on"
+        with closing(team.share_out(partial(_made, theirs), groups, advice=advice)) as results:
+            for made in results:
+                yield from made
 
 
 def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Fates]]:
@@ -225,10 +232,8 @@ def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list
     return True, damaged
 
 
-def _check(workers: int | None, part: tuple[int, int] | None, *, force: bool) -> None:
+def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     """Refuse arguments and an environment that make no sense before anything is touched."""
-    if workers is not None:
-        integer("workers", workers, least=1)
     if part is not None:
         _check_part(part)
     if force and part is not None:

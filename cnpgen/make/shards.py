@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.library import Backend
+from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.pipeline import Pipeline
@@ -35,19 +35,24 @@ class Job:
         blueprint: What it will hold.
         pipeline: The recipe.
         backend: Which kernels run.
-        cache_folder: Where they are cached.
+        cache_folder: Where they are cached; None where the machine that makes them caches them.
     """
 
     folder: Path
     blueprint: Blueprint
     pipeline: Pipeline
     backend: Backend
-    cache_folder: Path
+    cache_folder: Path | None
 
 
 def prepare(job: Job) -> PreparedPipeline:
-    """Load the stages of what is made."""
-    return PreparedPipeline(job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype)
+    """Load the stages of what is made.
+
+    Raises:
+        MachineError: The backend does not work on this machine.
+    """
+    cache_folder = choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
+    return PreparedPipeline(job.pipeline, backend=job.backend, cache_folder=cache_folder, dtype=job.blueprint.dtype)
 
 
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Fates]]:

@@ -14,7 +14,7 @@ import joblib
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.machine.workers import _signals_held, share_out, worker_count
+from cnpgen.machine.workers import signals_held, share_out, worker_count
 from tests.conftest import HANGING
 from tests.examples.tiny_datasets import digests, make_tiny
 
@@ -175,7 +175,7 @@ def test_a_signal_that_comes_while_workers_start_is_only_delayed():
     started, over = [], threading.Event()
 
     def interrupted() -> None:
-        with _signals_held():
+        with signals_held():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
             started.append(True)
