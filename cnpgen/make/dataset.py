@@ -120,16 +120,37 @@ def make_dataset(
     check_place(workspace)
     job = draw_up(loaded, workspace, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, force=force)
     job = replace(job, blueprint=open_workspace(folder, job.blueprint, force=force))
-    tasks = shards(job.blueprint)
-    mine = _part(tasks, part)
+    return carry_out(job, notes, engine=where, part=part, begin=begin, progress=progress)
+
+
+def carry_out(
+    job: Job,
+    notes: str,
+    *,
+    engine: Engine,
+    part: tuple[int, int] | None = None,
+    begin: Begin | None = None,
+    progress: Progress | None = None,
+) -> MadeDataset:
+    """Make what is missing of a dataset whose blueprint is written, and finish it if all of it is there then.
+
+    Args:
+        job: The dataset.
+        notes: Its data card.
+        engine: Where the work is shared out to.
+        part: As of ``make_dataset``, like all that follow.
+        begin: Called before rows are compared and before they are made.
+        progress: Called with the rows of every shard.
+    """
+    mine = _part(shards(job.blueprint), part)
     waiting, damaged = _take_stock(job, mine, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in mine)
-        begin("making", folder, rows, rows - sum(task.rows for task in waiting))
-    made = _make(job, waiting, where, progress)
-    complete, documents = _finish(job, notes, made=made, alone=part is None)
+        begin("making", job.folder, rows, rows - sum(task.rows for task in waiting))
+    made = _make(job, waiting, engine, progress)
+    complete, documents = finish(job.folder, job.blueprint, notes, made=made, alone=part is None)
     rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.blueprint.splits}
-    return MadeDataset(folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
+    return MadeDataset(job.folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
 
 
 def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
@@ -181,11 +202,16 @@ def _results(job: Job, tasks: list[ShardTask], engine: Engine) -> Generator[tupl
             for group in groups:
                 yield from make_shards(job, group)
             return
-        theirs = replace(job, folder=job.folder.absolute(), cache_folder=None) if team.is_far else job
+        theirs = _for_others(job) if team.is_far else job
         advice = f": the shards that are finished are safe in {job.folder}; {AGAIN} to go on"
         with closing(team.share_out(partial(_made, theirs), groups, advice=advice)) as results:
             for made in results:
                 yield from made
+
+
+def _for_others(job: Job) -> Job:
+    """Return a job as a machine can do it that sees the same folder, but perhaps no other files of this one."""
+    return replace(job, folder=job.folder.absolute(), pipeline=None, cache_folder=None)
 
 
 def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Fates]]:
@@ -209,26 +235,27 @@ def runs(blueprint: Blueprint, tasks: list[ShardTask], workers: int) -> list[lis
     return [list(group) for _, group in groupby(tasks, key=lambda task: (task.split, task.first_row // rows))]
 
 
-def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list[str]]:
+def finish(folder: Path, blueprint: Blueprint, notes: str, *, made: int, alone: bool) -> tuple[bool, list[str]]:
     """Write the documents of a dataset whose shards are all there; return whether they are, and what was damaged.
 
     Args:
-        job: The dataset.
+        folder: The dataset.
+        blueprint: Its blueprint.
         notes: Its data card.
         made: Rows that this call has made.
         alone: Whether nobody else is making parts of it, who might be about to write the documents.
     """
-    if pending(job.folder, job.blueprint):
+    if pending(folder, blueprint):
         return False, []
-    sealed, damaged = (job.folder / MANIFEST).exists(), list[str]()
+    sealed, damaged = (folder / MANIFEST).exists(), list[str]()
     if made == 0 and (sealed or alone):
-        findings = check_documents(job.folder, job.blueprint)
+        findings = check_documents(folder, blueprint)
         if not findings:
             return True, []
         damaged = list(dict.fromkeys(finding.file for finding in findings))
         if sealed:  # without a manifest the dataset was unfinished: a run may have ended just before
             warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
-    finalize(job.folder, job.blueprint, notes=notes)
+    finalize(folder, blueprint, notes=notes)
     return True, damaged
 
 

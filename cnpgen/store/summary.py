@@ -73,7 +73,7 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = Fa
     records, problems = [], []
     for task in shards(blueprint):
         try:
-            records.append((task, load_committed(folder, task, blueprint.fingerprint)))
+            records.append((task, load_committed(folder, task, blueprint.of(task).fingerprint)))
         except DatasetError as error:
             problems.append(str(error))
     summary = Summary(blueprint, tuple(records), tuple(problems))

@@ -170,15 +170,21 @@ def _shard_files(folder: Path) -> Iterator[Path]:
 
 def _refusal(found: Blueprint, wanted: Blueprint) -> str:
     """Say why a dataset cannot become another one, and what to do."""
-    same = (*INFORMATIONAL, "splits")
+    if changed := changed_settings(found, wanted):
+        return f"holds another dataset ({changed}); choose another out=, or replace it with force=True"
+    larger = all(rows <= wanted.splits.get(split, 0) for split, rows in found.splits.items())
+    extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if larger else ""
+    return (
+        f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; the rows that both sizes have are the"
+        f" same: {extend}choose another out=, or replace it with force=True"
+    )
+
+
+def changed_settings(found: Blueprint, wanted: Blueprint) -> str:
+    """Name up to three settings in which two blueprints differ, except for their sizes; nothing if there are none."""
+    same = (*INFORMATIONAL, "splits", "earlier")
     old, new = ({key: value for key, value in to_json(item).items() if key not in same} for item in (found, wanted))
-    changed = dict.fromkeys(_setting(difference) for difference in differences(old, new))
-    if not changed:
-        return (
-            f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; a dataset does not grow or shrink,"
-            " but the rows that both sizes have are the same: choose another out=, or replace it with force=True"
-        )
-    return f"holds another dataset ({'; '.join([*changed][:3])}); choose another out=, or replace it with force=True"
+    return "; ".join([*dict.fromkeys(_setting(difference) for difference in differences(old, new))][:3])
 
 
 def _setting(difference: Difference) -> str:

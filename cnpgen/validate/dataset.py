@@ -8,6 +8,7 @@ from typing import Any
 from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.report import RowReport
 from cnpgen.machine.engine import Engine
+from cnpgen.make.load import restored
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import Blueprint, load_blueprint, shards
 from cnpgen.store.check import Finding, check_dataset
@@ -16,7 +17,7 @@ from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
 from cnpgen.validate.blocks import Regeneration, backend_of, make_again
-from cnpgen.validate.documents import check_recipe, check_statistics, restored
+from cnpgen.validate.documents import check_recipe, check_statistics
 from cnpgen.validate.rows import DeepCheck, check_rows
 
 
@@ -137,7 +138,7 @@ def validate_dataset(
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
     _require_means(folder, blueprint, deep=deep, regenerate=regenerate)
-    present = [task for task in shards(blueprint) if is_committed(folder, task, blueprint.fingerprint)]
+    present = [task for task in shards(blueprint) if is_committed(folder, task, blueprint.of(task).fingerprint)]
     wrong = {finding.file for finding in findings if not finding.note}
     whole = [task for task in present if task.file not in wrong]
     findings += check_recipe(blueprint) + (check_statistics(folder, blueprint) if deep else [])

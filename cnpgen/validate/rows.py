@@ -15,12 +15,12 @@ from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.machine.engine import Engine, assembled
+from cnpgen.make.load import restored
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.check import DELETE, Finding
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
-from cnpgen.validate.documents import restored
 from cnpgen.validate.numbers import check_numbers
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)

@@ -14,7 +14,7 @@ import joblib
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.machine.workers import signals_held, share_out, worker_count
+from cnpgen.machine.workers import share_out, signals_held, worker_count
 from tests.conftest import HANGING
 from tests.examples.tiny_datasets import digests, make_tiny
 

@@ -75,7 +75,8 @@ def test_another_size_is_refused_with_what_can_be_done(folder, rows):
     text = str(caught.value)
     assert "holds this dataset with 660 rows (train 600, validation 60), not with" in text
     assert f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
-    assert "the rows that both sizes have are the same: choose another out=, or replace it with force=True" in text
+    extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if rows > 660 else ""
+    assert f"have are the same: {extend}choose another out=, or replace it with force=True" in text
     assert snapshot(folder) == before
 
 
