@@ -14,7 +14,8 @@ from cnpgen.make.shards import Job, prepare
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import REVISION, Blueprint, write_blueprint
 from cnpgen.store.card import card_notes
-from cnpgen.store.files.atomic import machine_error, sweep
+from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.leftovers import sweep
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import CARD, MANIFEST, WORK
 from cnpgen.store.paths import require_folder
