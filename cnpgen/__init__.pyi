@@ -30,7 +30,9 @@ from cnpgen.machine.versions import __version__ as __version__
 from cnpgen.make.boundary_problems import draw_boundary_problems as draw_boundary_problems
 from cnpgen.make.dataset import MadeDataset as MadeDataset
 from cnpgen.make.dataset import make_dataset as make_dataset
+from cnpgen.make.extend import extend_dataset as extend_dataset
 from cnpgen.make.load import load_dataset_recipe as load_dataset_recipe
+from cnpgen.make.merge import merge_datasets as merge_datasets
 from cnpgen.make.recipe import DatasetRecipe as DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline as load_pipeline
 from cnpgen.pipelines.pipeline import Pipeline as Pipeline

@@ -15,9 +15,11 @@ from cnpgen.cli import (
     doctor_command,
     evaluate_command,
     export_command,
+    extend_command,
     inspect_command,
     list_command,
     make_command,
+    merge_command,
     plan_command,
     refine_command,
     show_command,
@@ -34,6 +36,8 @@ from cnpgen.machine.threads import prefer_one_thread
 
 _COMMANDS = (
     make_command,
+    merge_command,
+    extend_command,
     list_command,
     show_command,
     inspect_command,

@@ -8,7 +8,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.schema.arguments import flag
-from cnpgen.store.blueprint import Blueprint
+from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.files.documents import load_document
 from cnpgen.store.files.limits import ALWAYS, EXPANSION
 from cnpgen.store.intact import AGAIN
@@ -60,7 +60,14 @@ def _recorded(folder: Path, summary: Summary) -> dict[str, list[Shard]]:
     blueprint = summary.blueprint
     return {
         split: [
-            Shard(folder / task.file, record.rows, record.first_sample_id, record.bytes, record.sha256, blueprint.key)
+            Shard(
+                folder / task.file,
+                record.rows,
+                record.first_sample_id,
+                record.bytes,
+                record.sha256,
+                blueprint.of(task).key,
+            )
             for task, record in summary.of_split(split)
         ]
         for split in blueprint.splits
@@ -77,9 +84,9 @@ def _listed(folder: Path, blueprint: Blueprint, manifest: Mapping[str, Any]) -> 
                 entry["first_sample_id"],
                 entry["bytes"],
                 entry["sha256"],
-                blueprint.key,
+                blueprint.of(ShardTask(split, index, entry["first_sample_id"], entry["rows"])).key,
             )
-            for entry in content["shards"]
+            for index, entry in enumerate(content["shards"])
         ]
         for split, content in manifest["splits"].items()
     }

@@ -60,7 +60,8 @@ class BoundaryFile:
             blueprint = load_blueprint(self.path.absolute().parents[1])
         except (DatasetError, IndexError):
             return None
-        return blueprint if blueprint.fingerprint == self.text("plan_fingerprint") else None
+        mine = self.text("plan_fingerprint")
+        return blueprint if any(each.fingerprint == mine for each in blueprint.generations) else None
 
     def problem(self) -> ProblemRecord | None:
         """Return the problem that the file, or the dataset that it lies in, says it is of; None if neither does.

@@ -171,7 +171,7 @@ def check_shard(
     if expected is None:  # nobody knows what the file should be, and findings says why
         return findings
     damage = _check_file(folder, task.file, *expected)
-    if damage and not _is_of_another_blueprint(path, blueprint):
+    if damage and not _is_of_another_blueprint(path, blueprint.of(task)):
         return findings + damage  # what HDF5 makes of a damaged file tells nothing, and may take forever
     content = check_content(folder, blueprint, task)
     if findings or damage:  # then make-dataset notices by itself that the shard is not the one that it made
@@ -205,7 +205,7 @@ def _check_sidecar(
     except DatasetError as error:
         return [Finding(task.sidecar, _reason(error, folder / task.sidecar), advice=MAKE_AGAIN)], expected
     findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
-    if record.plan_fingerprint != blueprint.fingerprint:
+    if record.plan_fingerprint != blueprint.of(task).fingerprint:
         text = f"belongs to another blueprint ({record.plan_fingerprint[:12]}...)"
         findings.append(Finding(task.sidecar, text, advice=MAKE_AGAIN))
     return findings, expected or (record.bytes, record.sha256)

@@ -2,7 +2,7 @@
 
 ```
 airhockey-replan-v1/
-  plan.json                 what will be made: written first, never changed
+  plan.json                 what will be made: written first, changed by an extension only
   train/shard-00000.h5      the rows
   train/shard-00000.json    the sidecar: that shard's commit record, written after it
   validation/...

@@ -14,9 +14,10 @@ from cnpgen.store.blueprint import Blueprint, shards
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
 from cnpgen.store.field import Field
-from cnpgen.store.files.atomic import file_sha256, sweep, write_file
+from cnpgen.store.files.atomic import file_sha256, write_file
 from cnpgen.store.files.documents import load_document, plain, render, save_document
 from cnpgen.store.files.forms import EVERY, TEXT, WHOLE
+from cnpgen.store.files.leftovers import sweep_all
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 from cnpgen.store.summary import Summary, stats_document, summarise
 
@@ -57,7 +58,7 @@ def finalize(folder: Path, blueprint: Blueprint, *, notes: str = "") -> dict[str
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
-    write_file(folder / CARD, card_text(summary, folder=folder.resolve().name, notes=notes))
+    write_file(folder / CARD, card_text(summary, folder=_name(folder), notes=notes))
     croissant = plain(croissant_document(summary, created=created))
     write_file(folder / CROISSANT, render(croissant) + "\n")
     manifest = _manifest(folder, summary, created=created)
@@ -66,9 +67,14 @@ def finalize(folder: Path, blueprint: Blueprint, *, notes: str = "") -> dict[str
     return cast(dict[str, Any], plain(manifest))
 
 
+def _name(folder: Path) -> str:
+    """Return the name of a folder as text; bytes in it that are not UTF-8 become question marks."""
+    return os.fsencode(folder.resolve().name).decode(errors="replace")
+
+
 def _remove_work(work: Path) -> None:
     """Remove the folder for temporary files: every shard is committed, so nobody needs it; foreign files are kept."""
-    sweep(work, older_than=0.0)
+    sweep_all(work)
     with suppress(OSError):
         work.rmdir()
 

@@ -142,14 +142,15 @@ def commit_shard(
         DatasetError: The columns are not what the blueprint says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    if is_committed(folder, task, blueprint.fingerprint):  # by somebody to whom the same work was given
+    fingerprint = blueprint.of(task).fingerprint
+    if is_committed(folder, task, fingerprint):  # by somebody to whom the same work was given
         return load_record(folder, task)
     about = {"fates": fates, "started": started, "seconds": seconds, "versions": versions or {}}
     try:
         return _write(folder, blueprint, task, columns, about)
     except CnpgenError:
         # somebody may have committed it meanwhile, finished the dataset and swept our temporary file away with theirs
-        if is_committed(folder, task, blueprint.fingerprint):
+        if is_committed(folder, task, fingerprint):
             return load_record(folder, task)
         raise
 
@@ -162,7 +163,7 @@ def _write(
     about: Mapping[str, Any],
 ) -> ShardRecord:
     """Write a shard and then its sidecar, which says how the shard came about, unless somebody else has meanwhile."""
-    path = folder / task.file
+    path, fingerprint = folder / task.file, blueprint.of(task).fingerprint
     size = write_shard(
         path, columns, blueprint.fields, shard_attributes(blueprint, task), dtype=blueprint.dtype, work=folder / WORK
     )
@@ -172,11 +173,11 @@ def _write(
         sha256=file_sha256(path),
         rows=task.rows,
         first_sample_id=task.first_row,
-        plan_fingerprint=blueprint.fingerprint,
+        plan_fingerprint=fingerprint,
         statistics=column_statistics(columns, blueprint.fields),
         **about,
     )
-    if is_committed(folder, task, blueprint.fingerprint):  # meanwhile, by somebody who may have summed up their record
+    if is_committed(folder, task, fingerprint):  # meanwhile, by somebody who may have summed up their record
         return load_record(folder, task)
     save_record(folder, task, record)
     return record
@@ -234,4 +235,4 @@ def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
 
 def pending(folder: Path, blueprint: Blueprint) -> list[ShardTask]:
     """List the shards that are still to be made, in order."""
-    return [task for task in shards(blueprint) if not is_committed(folder, task, blueprint.fingerprint)]
+    return [task for task in shards(blueprint) if not is_committed(folder, task, blueprint.of(task).fingerprint)]

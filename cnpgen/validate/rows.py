@@ -15,13 +15,13 @@ from cnpgen.judges.rows.hits import HitRule, hit_rule, repeated_share, shares_of
 from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
-from cnpgen.machine.workers import share_out
+from cnpgen.machine.engine import Engine, assembled
+from cnpgen.make.load import restored
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.check import DELETE, Finding
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
-from cnpgen.validate.documents import restored
 from cnpgen.validate.numbers import check_numbers
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
@@ -45,7 +45,7 @@ class DeepCheck:
 
 
 def check_rows(
-    folder: Path, blueprint: Blueprint, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
+    folder: Path, blueprint: Blueprint, tasks: list[ShardTask], engine: Engine, progress: Callable[[int], None] | None
 ) -> DeepCheck:
     """Recompute every row, shard by shard, and judge every plan.
 
@@ -53,16 +53,18 @@ def check_rows(
         folder: The dataset.
         blueprint: Its blueprint.
         tasks: The shards to read.
-        workers: Processes.
+        engine: Where the work is shared out to.
         progress: Called with the rows of every shard that was read.
     """
     checks, findings = [], []
-    with closing(share_out(partial(_verify_shard, folder, blueprint), tasks, workers, ordered=True)) as results:
-        for task, result in zip(tasks, results, strict=True):
-            findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
-            checks.append(result)
-            if progress is not None:
-                progress(task.rows)
+    with assembled(engine, len(tasks)) as team:
+        verify = partial(_verify_shard, folder.absolute() if team.is_far else folder, blueprint)
+        with closing(team.share_out(verify, tasks, ordered=True)) as results:
+            for task, result in zip(tasks, results, strict=True):
+                findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
+                checks.append(result)
+                if progress is not None:
+                    progress(task.rows)
     every = np.concatenate([np.empty(0, np.uint64), *(check.keys for check in checks)])
     twice = len(every) - len(np.unique(every))
     if twice:
