@@ -28,6 +28,9 @@ from cnpgen.losses.quadrature import rotating_shift as rotating_shift
 from cnpgen.machine.times import Times as Times
 from cnpgen.machine.versions import __version__ as __version__
 from cnpgen.make.boundary_problems import draw_boundary_problems as draw_boundary_problems
+from cnpgen.make.complete import Completed as Completed
+from cnpgen.make.complete import complete as complete
+from cnpgen.make.complete import complete_table as complete_table
 from cnpgen.make.dataset import MadeDataset as MadeDataset
 from cnpgen.make.dataset import make_dataset as make_dataset
 from cnpgen.make.load import load_dataset_recipe as load_dataset_recipe

@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.kernels.library import Backend, problem_kernels
+from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.piece import Block, Piece
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Array, Round
 from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import EXACTNESS
-from cnpgen.problems.robot import load_robot
 from cnpgen.store.field import Field
 
 HOPELESS = 1e-4  # acceptance below which a pipeline is given up, once it has had a fair chance
@@ -41,17 +40,14 @@ class PreparedPipeline:
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
         if dtype not in list(EXACTNESS):
             raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
-        problem = pipeline.problem
-        robot = load_robot(problem)
-        kernels = problem_kernels(problem, robot, backend, cache_folder)
         self.pipeline = pipeline
         self.block_rows = min(stage.block_rows for stage in pipeline.stage)
-        self.context = Context(problem, robot, kernels, dtype)
+        self.context = load_context(pipeline.problem, backend, cache_folder, dtype)
         steps = steps_of(pipeline)
         self.fields = stored_fields(steps, self.context)
         written = written_columns(pipeline.path, steps, self.context)
-        with kernels.compiling_together():
-            self._stages = prepare_steps(steps, self.context)
+        with self.context.kernels.compiling_together():
+            self._stages = prepare_steps(steps, lambda stage: stage.prepare(self.context))
             self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
