@@ -48,6 +48,7 @@ from cnpgen.planner.network.features import Features as Features
 from cnpgen.planner.omega import Omega as Omega
 from cnpgen.planner.planner import Planner as Planner
 from cnpgen.planner.planner import states_at as states_at
+from cnpgen.planner.strike import Strikes as Strikes
 from cnpgen.planner.tasks import Tasks as Tasks
 from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
 from cnpgen.plans.evaluate import Evaluation as Evaluation

@@ -18,17 +18,19 @@ NAMED = 10  # tasks without an answer, by number
 _TEXT = """\
 The stages of the pipeline find, in their order, what tasks do not give: 'goal_xyz.x,goal_xyz.y,hit_angle' is enough to
 hit a puck. Columns are those of datasets, components after a dot, numbers in SI. The start is given by joints
-(start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); of which nothing is given, it is the problem's base at
+(start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); if nothing of it is given it is the problem's base at
 rest. A hit is as fast as possible unless hit_speed [m/s] or hit_speed_share says otherwise. docs/tasks.md has examples.
 What 'cnpgen solve', 'refine' and 'plan' make plans for is written to OUT, which is printed on stdout; sample_id says
-which task each problem is. Tasks that have no answer are left out, with the reason on stderr; the exit code is 1 if none
-has one.
+which task each problem is. Tasks that have no answer are left out, with the reason on stderr; the exit code is 1 if no
+task has one.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "complete", run, title="make boundary problems of tasks in the workspace", text=_TEXT)
+    parser = add_command(
+        commands, "complete", run, title="make boundary problems of tasks in the workspace", text=_TEXT
+    )
     option = parser.add_argument
     option("pipeline", metavar="NAME|FILE", help="a pipeline or dataset by name, or a recipe file")
     option("tasks", metavar="TASKS", type=Path, help="a table of tasks: CSV, or HDF5")

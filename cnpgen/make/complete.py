@@ -60,8 +60,8 @@ def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayL
 
     Args:
         recipe: Name of a shipped pipeline or dataset, path of a recipe file, or a loaded recipe.
-        columns: Name -> values in SI units, as datasets name them: shape (w,) for one task or (N, w), scalars one number
-            or shape (N,). One task's value holds for all.
+        columns: Name -> values in SI units, as datasets name them: shape (w,) for one task or (N, w), scalars one
+            number or shape (N,). One task's value holds for all.
 
     Raises:
         UsageError: There is no such column, something has the wrong shape or is not finite, or a goal is missing.

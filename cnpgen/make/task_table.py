@@ -1,4 +1,4 @@
-"""Tables of tasks: CSV or HDF5 with the columns of a dataset, components after a dot (``goal_xyz.x``, ``hit_angle``)."""
+"""Tables of tasks: CSV or HDF5 with the columns of datasets, components after a dot: ``goal_xyz.x``, ``hit_angle``."""
 
 import csv
 from collections.abc import Mapping
@@ -22,8 +22,8 @@ def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
     """Read tasks from a table.
 
     Args:
-        path: A table of CSV, whose first line names the columns, or a file of HDF5, whose datasets are columns, or whole
-            fields of shape (N, width). Numbers are in SI.
+        path: A table of CSV, whose first line names the columns, or a file of HDF5, whose datasets are columns, or
+            whole fields of shape (N, width). Numbers are in SI.
         fields: What tasks may give: name -> field.
 
     Returns:
@@ -39,7 +39,7 @@ def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
     known = {**fields, **{column: field for field in fields.values() for column in field.columns}}
     for name, values in columns.items():
         if name not in known:
-            raise DatasetError(_unknown(path, name, _told(fields)))
+            raise DatasetError(_unknown(path, name, fields))
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
             raise DatasetError(f"{path}: {name} must be a finite number in every task, got {values[row]} in task {row}")
@@ -51,12 +51,9 @@ def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
     return found
 
 
-def _unknown(path: Path, name: str, known: list[str]) -> str:
-    return f"{path}: tasks of this pipeline cannot give {name!r}{nearest(name, known)}; they can: {', '.join(known)}"
-
-
-def _told(fields: Mapping[str, Field]) -> list[str]:
-    return [column for field in fields.values() for column in field.columns]
+def _unknown(path: Path, name: str, fields: Mapping[str, Field]) -> str:
+    hint = nearest(name, [column for field in fields.values() for column in field.columns])
+    return f"{path}: tasks of this pipeline cannot give {name!r}{hint or ', only ' + ', '.join(fields)}"
 
 
 def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array]) -> Array:
@@ -91,7 +88,7 @@ def _hdf5_columns(path: Path) -> dict[str, Array]:
 def _csv_columns(path: Path) -> dict[str, Array]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)]
+            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise DatasetError(f"{path} is no table of CSV in UTF-8: {error}") from error
     except OSError as error:

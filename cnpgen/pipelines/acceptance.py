@@ -74,9 +74,7 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
     return work
 
 
-def boundary_unmet(
-    robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True
-) -> Any:
+def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True) -> Any:
     """Build ``(q, dq, ddq, tops, position) -> unmet``, positive where a boundary state is not exact or not a number.
 
     Args:

@@ -80,9 +80,11 @@ class Completion:
         Returns:
             Name -> values, shape (M, width), or (M,) of scalars; tasks know which they are: ``tasks.alive``.
         """
-        found = {field.name: tasks[field.name] for field in self._fields if field.name in tasks.columns}
-        scalars = {field.name for field in self._fields if not field.width}
-        return {name: values[0] if name in scalars else np.ascontiguousarray(values.T) for name, values in found.items()}
+        fields = [field for field in self._fields if field.name in tasks.columns]
+        return {
+            field.name: np.ascontiguousarray(tasks[field.name].T) if field.width else tasks[field.name][0]
+            for field in fields
+        }
 
     def _derive(self, draws: Tasks) -> None:
         for name in self._derived:
@@ -116,7 +118,9 @@ def _check(pipeline: Pipeline, fields: Mapping[str, Field], given: Collection[st
             raise UsageError(f"the pipeline {pipeline.name!r} {lacks('column to give', name, fields)}")
     for joints, position in _EITHER:
         if joints in given and position in given:
-            raise UsageError(f"{joints} and {position} are both given: the joints say where the tip is, give one of them")
+            raise UsageError(
+                f"{joints} and {position} are both given: the joints say where the tip is, give one of them"
+            )
     if not {"goal_q", "goal_xyz"} & set(given):
         raise UsageError(f"tasks of the pipeline {pipeline.name!r} must give goal_xyz, where the tip is to be")
 

@@ -35,13 +35,18 @@ class PreparedPipeline:
         context: Problem, robot and kernels.
         fields: The fields of a row, in stored order.
         block_rows: Rows per block.
+        tasks: How many draws there are at all, all in one block; None where they never end.
+
+    Raises:
+        RecipeError: The stages do not fit together, or to the problem.
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
         if dtype not in list(EXACTNESS):
             raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
         self.pipeline = pipeline
-        self.block_rows = min(stage.block_rows for stage in pipeline.stage)
+        self.tasks = listed_tasks(pipeline)
+        self.block_rows = min(stage.block_rows for stage in pipeline.stage) if self.tasks is None else self.tasks
         self.context = load_context(pipeline.problem, backend, cache_folder, dtype)
         steps = steps_of(pipeline)
         self.fields = stored_fields(steps, self.context)
@@ -85,6 +90,7 @@ class PreparedPipeline:
         waiting = deque(Piece(self.fields, first, stop) for first, stop in ranges)
         made = tried = 0
         while waiting:
+            self._check_left(tried, made, waiting[-1].stop, index)
             draws = self._round(random, self._round_size(made, tried))
             tried += draws.size
             while waiting and waiting[0].take(draws, made):
@@ -94,7 +100,7 @@ class PreparedPipeline:
                 self._check_hope(draws, made, tried)
 
     def _round(self, random: np.random.Generator, size: int) -> Round:
-        draws = Round(size)
+        draws = Round(size, last=self.tasks is not None)
         for label, work in self._stages:
             draws.stage = label
             work(draws, random)
@@ -112,12 +118,25 @@ class PreparedPipeline:
         It depends on the block alone and not on how many of its rows are wanted.
         """
         rows = self.block_rows
+        if self.tasks is not None:
+            return self.tasks
         if tried == 0:
             return rows // 2
         if made == 0:
             return 2 * rows
         missing = (rows - made) * tried / made
         return int(np.clip(np.ceil(1.03 * missing) + rows // 128, rows // 16, 2 * rows))
+
+    def answers(self, seed: int) -> Round:
+        """Return all listed tasks, those without an answer rejected."""
+        assert self.tasks is not None
+        return self._round(random_generator(seed, "", 0), self.tasks)
+
+    def _check_left(self, tried: int, made: int, wanted: int, index: int) -> None:
+        """Refuse to make more rows than there are answers to listed tasks."""
+        if self.tasks is not None and (tried or index):
+            found = f"{made} of its {self.tasks} tasks have an answer" if tried else f"it lists {self.tasks} tasks"
+            raise UsageError(f"{self.pipeline.name}: {found}, {index * self.block_rows + wanted} rows are asked for")
 
     def _check_hope(self, draws: Round, made: int, tried: int) -> None:
         if tried >= FAIR_CHANCE and made < HOPELESS * tried:
@@ -126,6 +145,18 @@ class PreparedPipeline:
             reasons = ", ".join(f"{reason} ({count / draws.size:.1%})" for count, reason in worst if count)
             text = f"{made} of {tried:,} draws were accepted; of the last {draws.size:,}, rejected for {reasons}"
             raise RecipeError([f"{self.pipeline.path}: {text}"])
+
+
+def listed_tasks(pipeline: Pipeline) -> int | None:
+    """Return how many draws there are where a stage lists them; None where none does.
+
+    Raises:
+        RecipeError: More than one stage lists them.
+    """
+    listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
+    if len(listed) > 1:
+        raise RecipeError([f"{pipeline.path}: {len(listed)} stages list positions, expected one at most"])
+    return listed[0] if listed else None
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:

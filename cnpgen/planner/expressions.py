@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics, symbols
+from cnpgen.symbolic.state import SymbolicState, Vec, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -20,7 +20,7 @@ class BehindPuck(Stage):
 
     def describe(self) -> str:
         """Say how far."""
-        return f"take the goal for the puck's centre: the tip is to be {1e3 * self.distance:g} mm behind it along the hit"
+        return f"take the goal for the puck's centre: the tip meets it {1e3 * self.distance:g} mm behind, along the hit"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The goal position, anywhere on the table."""
@@ -43,10 +43,10 @@ def behind(puck: Array, angle: Array, distance: float) -> Array:
     """Return positions that are a distance [m] behind those of pucks, along hits in a horizontal direction.
 
     Args:
-        puck: Positions [m], shape (3, N).
+        puck: Positions [m], shape (3, N), or (2, N) without their height.
         angle: Directions of the hits about world z [rad], shape (1, N).
         distance: How far [m].
     """
     along = np.concatenate([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
-    moved: Array = puck - distance * along
+    moved: Array = puck - distance * along[: len(puck)]
     return moved

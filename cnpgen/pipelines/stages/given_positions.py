@@ -34,14 +34,13 @@ class GivenPositions(Stage):
                 yield key, f"expected 3 entries, for x, y and z, got {len(getattr(self, key))}"
         if self.counts and not self.grid:
             yield "counts", "counts are for a grid, and there is none"
-        tasks = len(self.goal) if self.goal else int(np.prod(self.counts))
-        if len(self.start) not in {0, 1, tasks}:
-            yield "start", f"expected one position for all, or one for each of {tasks}, got {len(self.start)}"
+        if len(self.start) not in {0, 1, self.tasks}:
+            yield "start", f"expected one position for all, or one for each of {self.tasks}, got {len(self.start)}"
 
     @property
     def tasks(self) -> int:
-        """How many tasks there are."""
-        return len(self._goals())
+        """How many goals there are."""
+        return len(self.goal) or int(np.prod(self.counts))
 
     def describe(self) -> str:
         """Say which positions."""

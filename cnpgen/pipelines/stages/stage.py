@@ -31,10 +31,11 @@ class Round:
         stage: Label of the stage that works on the round now.
         origins: Reason -> label of the stage that first gave it.
         drawn: Name -> values of all draws, shape (width, N), for columns written before any rejection.
+        last: Whether no draws can follow, so that all of this round count.
     """
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    def __init__(self, size: int, *, last: bool = False) -> None:
+        self.size, self.last = size, last
         self.alive = np.arange(size)
         self.fate = np.zeros(size, np.uint16)
         self.reasons: list[str] = []
@@ -87,6 +88,11 @@ class Stage(ABC):
     """
 
     block_rows: ClassVar[int] = BLOCK_ROWS
+
+    @property
+    def tasks(self) -> int | None:
+        """How many draws there are at all, where they are listed and each is made once; None where they never end."""
+        return None
 
     @property
     def needs(self) -> tuple[str, ...]:
