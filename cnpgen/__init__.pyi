@@ -55,6 +55,8 @@ from cnpgen.plans.evaluate import Evaluation as Evaluation
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
 from cnpgen.plans.export import Exported as Exported
 from cnpgen.plans.export import export_plans as export_plans
+from cnpgen.plans.join import JoinedPlans as JoinedPlans
+from cnpgen.plans.join import join_plans as join_plans
 from cnpgen.plans.load import load_plans as load_plans
 from cnpgen.plans.plans import PlanIndexError as PlanIndexError
 from cnpgen.plans.plans import Plans as Plans

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.completion import Completion
+from cnpgen.planner.keeping import keep_what_is_faster
 from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
@@ -166,6 +167,10 @@ class Planner:
         At its very end a plan may still accelerate, because goal accelerations are free. What follows a motion that
         ends at rest begins at rest: ``plan`` from its goal.
 
+        To a goal that has not moved no plan takes longer than what was left: where the network's is not faster by 2 %,
+        it is the rest of the old plan, with exact ends and the same duration, written anew. Where accelerations would
+        differ by more than 0.1 % of the limits, all plans that are returned have two or three spans for each of theirs.
+
         Args:
             plans: One plan or N, by any planner of the same robot.
             time: When the new plans take over, since the start of the old ones [s], one number or shape (N,). Planning
@@ -177,7 +182,9 @@ class Planner:
             UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
         """
         q, dq, ddq = states_at(plans, time)
-        return self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
+        new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
+        times = np.broadcast_to(numbers("time", time), (len(plans),))
+        return keep_what_is_faster(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
     def _rested(self, boundary: Boundary) -> Boundary:
         """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""
