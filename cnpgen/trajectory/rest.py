@@ -1,8 +1,8 @@
 """What is left of motions after a moment, as motions of their own.
 
 The rest of a spline is a spline, but not one whose knots are evenly spaced, as those of motions are. So it is written
-anew, by least squares, with exact ends and the same duration. Where few knots are left that is exact to rounding; before,
-as many knots as it takes are put between those that there were.
+anew, by least squares, with exact ends and the same duration. Where few knots are left that is exact to rounding; where
+many are, two or three spans take the place of one.
 """
 
 from functools import cache
@@ -83,7 +83,7 @@ def _fits(spec: TrajectorySpec, end: int) -> tuple[Array, Array, Array, Array]:
     """Return phases, what fits rates there, the path's basis, and what fits its control points from 3 to ``end``."""
     phases = chebyshev(4 * max(spec.path_control_points, spec.rate_control_points))
     rate, path = (basis(phases, points, spec.degree) for points in (spec.rate_control_points, spec.path_control_points))
-    return phases, np.linalg.pinv(rate), path, np.linalg.pinv(path[:, 3:end])
+    return phases, np.asarray(np.linalg.pinv(rate)), path, np.asarray(np.linalg.pinv(path[:, 3:end]))
 
 
 @cache
