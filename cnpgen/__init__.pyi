@@ -28,6 +28,9 @@ from cnpgen.losses.quadrature import rotating_shift as rotating_shift
 from cnpgen.machine.times import Times as Times
 from cnpgen.machine.versions import __version__ as __version__
 from cnpgen.make.boundary_problems import draw_boundary_problems as draw_boundary_problems
+from cnpgen.make.complete import Completed as Completed
+from cnpgen.make.complete import complete as complete
+from cnpgen.make.complete import complete_table as complete_table
 from cnpgen.make.dataset import MadeDataset as MadeDataset
 from cnpgen.make.dataset import make_dataset as make_dataset
 from cnpgen.make.extend import extend_dataset as extend_dataset
@@ -47,12 +50,15 @@ from cnpgen.planner.network.features import Features as Features
 from cnpgen.planner.omega import Omega as Omega
 from cnpgen.planner.planner import Planner as Planner
 from cnpgen.planner.planner import states_at as states_at
+from cnpgen.planner.strike import Strikes as Strikes
 from cnpgen.planner.tasks import Tasks as Tasks
 from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
 from cnpgen.plans.evaluate import Evaluation as Evaluation
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
 from cnpgen.plans.export import Exported as Exported
 from cnpgen.plans.export import export_plans as export_plans
+from cnpgen.plans.join import JoinedPlans as JoinedPlans
+from cnpgen.plans.join import join_plans as join_plans
 from cnpgen.plans.load import load_plans as load_plans
 from cnpgen.plans.plans import PlanIndexError as PlanIndexError
 from cnpgen.plans.plans import Plans as Plans

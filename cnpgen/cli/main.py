@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cnpgen.cli import (
+    complete_command,
     doctor_command,
     evaluate_command,
     export_command,
@@ -44,6 +45,7 @@ _COMMANDS = (
     validate_command,
     train_command,
     plan_command,
+    complete_command,
     solve_command,
     refine_command,
     evaluate_command,
@@ -62,6 +64,7 @@ examples:
   cnpgen train airhockey-hit-v1 -o hits.h5           train a planner: two minutes
   cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5; a shipped one: --model airhockey-hit
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
+  cnpgen complete airhockey-replan pucks.csv -o problems.h5; what is solved, refined or planned for
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators

@@ -25,10 +25,12 @@ CONTRACTS: dict[str, str] = {  # what a kind is a subclass of
 BUILT_IN: dict[str, dict[str, str]] = {
     STAGES: {
         "draw-positions": "cnpgen.pipelines.stages.draw:DrawPositions",
+        "given-positions": "cnpgen.pipelines.stages.given_positions:GivenPositions",
         "start-ik": "cnpgen.pipelines.stages.ik:StartIK",
         "goal-ik": "cnpgen.pipelines.stages.ik:GoalIK",
         "hit-angle-to-goal": "cnpgen.pipelines.stages.hit_angle:HitAngleToGoal",
         "hit-angle-in-cone": "cnpgen.pipelines.stages.hit_angle:HitAngleInCone",
+        "behind-puck": "cnpgen.pipelines.stages.behind_puck:BehindPuck",
         "hitting-configuration": "cnpgen.pipelines.stages.hitting_configuration:HittingConfiguration",
         "hitting-velocity": "cnpgen.pipelines.stages.hitting_velocity:HittingVelocity",
         "at-rest": "cnpgen.pipelines.stages.motion:AtRest",

@@ -265,6 +265,14 @@ def symbols(name: str, width: int) -> tuple[Any, Vec]:
     return column, ca.vertsplit(column)
 
 
+def tip_position(robot: "Robot") -> Any:
+    """Build ``q -> p``, the tip's position [m], as an SX function."""
+    import casadi as ca
+
+    q_sx, q = symbols("q", robot.n)
+    return ca.Function("tip_position", [q_sx], [ca.vertcat(*forward_kinematics(robot.chain, q).tip)])
+
+
 def _turn(joint: Joint, angle: Scalar) -> list[Vec]:
     """Rotation about the joint axis: a a^T + cos (I - a a^T) + sin [a]x, identity for prismatic joints."""
     import casadi as ca
