@@ -76,6 +76,10 @@ from cnpgen.robots.spec import LimitSpec as LimitSpec
 from cnpgen.robots.spec import Obstacle as Obstacle
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
+from cnpgen.simulator.executed import Executed as Executed
+from cnpgen.simulator.plant import Plant as Plant
+from cnpgen.simulator.simulate import Simulation as Simulation
+from cnpgen.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.store.blueprint import Blueprint as Blueprint
 from cnpgen.store.blueprint import ShardTask as ShardTask
 from cnpgen.store.blueprint import StoredProblem as StoredProblem

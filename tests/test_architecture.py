@@ -20,7 +20,7 @@ FLOORS = (
     ("problems",),
     ("pipelines", "judges", "losses"),
     ("plans", "plugins"),
-    ("refine", "planner"),
+    ("refine", "planner", "simulator"),
     ("make", "training", "interop"),
     ("validate",),
     ("cli", "__init__"),
@@ -28,8 +28,8 @@ FLOORS = (
 )
 # What a room must not import although it stands on a floor below: judges share no code with what they judge.
 SOLVERS = ("symbolic", "kernels", "pipelines", "losses", "refine", "planner")
-APART = {"judges": SOLVERS, "world": SOLVERS}
-HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp")
+APART = {"judges": SOLVERS, "world": SOLVERS, "simulator": SOLVERS}
+HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp", "mujoco", "imageio")
 FRAMEWORKS = ("torch", "jax", "tensorflow")
 BRIDGES = ("interop.tensorflow",)  # those of one file; users import them
 MODULES = sorted(
@@ -180,7 +180,7 @@ def python(code: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "command", ["", "make-dataset", "validate", "inspect", "list", "show", "evaluate", "export", "doctor"]
+    "command", ["", "make-dataset", "validate", "inspect", "list", "show", "evaluate", "simulate", "export", "doctor"]
 )
 def test_help_is_given_without_loading_anything_heavy(command: str) -> None:
     code = f"""

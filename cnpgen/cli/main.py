@@ -21,6 +21,7 @@ from cnpgen.cli import (
     plan_command,
     refine_command,
     show_command,
+    simulate_command,
     solve_command,
     train_command,
     validate_command,
@@ -42,6 +43,7 @@ _COMMANDS = (
     solve_command,
     refine_command,
     evaluate_command,
+    simulate_command,
     export_command,
     doctor_command,
 )
@@ -59,6 +61,7 @@ examples:
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
+  cnpgen simulate plans.h5 --video plan.mp4          execute them in MuJoCo
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
 
 stdout is data, stderr everything else. Exit codes:
