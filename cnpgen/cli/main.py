@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cnpgen.cli import (
+    benchmark_command,
     doctor_command,
     evaluate_command,
     export_command,
@@ -44,6 +45,7 @@ _COMMANDS = (
     refine_command,
     evaluate_command,
     simulate_command,
+    benchmark_command,
     export_command,
     doctor_command,
 )
@@ -62,6 +64,7 @@ examples:
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
   cnpgen simulate plans.h5 --video plan.mp4          execute them in MuJoCo
+  cnpgen benchmark hits-81 --simulate                compare planners
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
 
 stdout is data, stderr everything else. Exit codes:

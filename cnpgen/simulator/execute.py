@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, RecipeError
+from cnpgen.judges.plans.metrics import tilt
 from cnpgen.simulator import hockey
 from cnpgen.simulator.controller import Controller
 from cnpgen.simulator.executed import Executed
@@ -156,7 +157,9 @@ class _Run:
         common = Executed(
             finished=bool(np.linalg.norm(tip[ticks - 1] - self._goal) < NEAR),
             z_error=np.nan if height is None else TICK * float(np.abs(tip[during, 2] - height).sum()),
-            vertical_error=np.nan if height is not None else TICK * float(_tilt(rotation[during]).sum()),
+            vertical_error=np.nan
+            if height is not None
+            else TICK * float(tilt(rotation[during].transpose(1, 2, 0)).sum()),
             tracking_error=TICK * float(np.abs(q[during] - wanted[during]).sum()),
             torque_use=float(share.max()),
         )
@@ -181,10 +184,3 @@ class _Run:
             hit_time=first * TICK,
             puck_speed=float(away.max()),
         )
-
-
-def _tilt(rotation: Array) -> Array:
-    """|roll| + |pitch| of rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` [rad], shape (K, 3, 3) -> (K,)."""
-    R = rotation
-    pitch = np.arctan2(R[:, 2, 0], np.hypot(R[:, 2, 1], R[:, 2, 2]))
-    return np.asarray(np.abs(np.arctan2(R[:, 2, 1], R[:, 2, 2])) + np.abs(pitch))

@@ -62,8 +62,8 @@ PLANTS = {
     plant.name: plant
     for plant in (
         Plant("nominal", "friction and damping that the controller does not know"),
-        Plant("heavier", "and 10 % more mass", mass=1.1),
-        Plant("delayed", "and torques that take effect 1 ms late", delay=1),
+        Plant("heavier", "the same with 10 % more mass and inertia", mass=1.1),
+        Plant("delayed", "the same with torques that take effect 1 ms late", delay=1),
     )
 }
 

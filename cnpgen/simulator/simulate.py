@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.record import ProblemRecord, open_problem
+from cnpgen.problems.record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.simulator.execute import Execution, execute, load_mujoco
 from cnpgen.simulator.executed import Executed
@@ -22,7 +22,6 @@ from cnpgen.simulator.hockey import puck_of
 from cnpgen.simulator.plant import Plant, as_plant
 from cnpgen.simulator.reference import Reference, reference_of
 from cnpgen.simulator.scene import Scene
-from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
@@ -128,27 +127,24 @@ def execute_plan(plan: Plans, plant: Plant) -> tuple[Scene, Reference, Execution
     """
     _, robot = open_problem(plan.problem)
     reference = reference_of(plan.motion, acceleration_limit=robot.acceleration_limit)
-    start_xyz, goal_xyz = plan.columns["start_xyz"][0], plan.columns["goal_xyz"][0]
-    scene = scene_of(plan.problem, plan.boundary, start_xyz, goal_xyz, plant)
-    return scene, reference, execute(scene, reference, goal_xyz)
+    scene = scene_of(plan, plant)
+    return scene, reference, execute(scene, reference, plan.columns["goal_xyz"][0])
 
 
-def scene_of(record: ProblemRecord, boundary: Boundary, start_xyz: Array, goal_xyz: Array, plant: Plant) -> Scene:
-    """Set the scene of one boundary problem.
+def scene_of(problem: Plans, plant: Plant) -> Scene:
+    """Set the scene of one boundary problem: obstacles, and the puck where its goal is a hit.
 
     Args:
-        record: The problem.
-        boundary: Boundary conditions of one motion.
-        start_xyz: Where the tip begins [m], shape (3,): it says where obstacles below the object stand.
-        goal_xyz: Where it ends [m], shape (3,).
+        problem: One boundary problem, or a plan for it.
         plant: The robot.
     """
-    problem, robot = open_problem(record)
-    scene = Scene(problem, robot, plant, obstacle_tops(problem, start_xyz, goal_xyz))
+    meaning, robot = open_problem(problem.problem)
+    start_xyz, goal_xyz = problem.columns["start_xyz"][0], problem.columns["goal_xyz"][0]
+    scene = Scene(meaning, robot, plant, obstacle_tops(meaning, start_xyz, goal_xyz))
     if scene.height is None:
         return scene
-    velocity = _tip_velocity(robot, boundary.goal_q[0], boundary.goal_dq[0])
-    return Scene(problem, robot, plant, scene.tops, puck_of(goal_xyz, velocity))
+    velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])
+    return replace(scene, puck=puck_of(goal_xyz, velocity))
 
 
 def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:
