@@ -1,3 +1,13 @@
+from cnpgen.benchmark.planner import BenchmarkPlanner as BenchmarkPlanner
+from cnpgen.benchmark.planner import Setting as Setting
+from cnpgen.benchmark.pucks import Pucks as Pucks
+from cnpgen.benchmark.report import save_benchmark_report as save_benchmark_report
+from cnpgen.benchmark.run import Benchmark as Benchmark
+from cnpgen.benchmark.run import run_benchmark as run_benchmark
+from cnpgen.benchmark.suite import Draws as Draws
+from cnpgen.benchmark.suite import Suite as Suite
+from cnpgen.benchmark.suite import load_suite as load_suite
+from cnpgen.benchmark.trajectory import Trajectory as Trajectory
 from cnpgen.errors import CnpgenError as CnpgenError
 from cnpgen.errors import DatasetError as DatasetError
 from cnpgen.errors import MachineError as MachineError

@@ -9,7 +9,7 @@ from typing import Any
 from cnpgen.benchmark.execution import execution_of
 from cnpgen.benchmark.results import answer_from_dict
 from cnpgen.benchmark.run import Benchmark
-from cnpgen.benchmark.statistics import FIGURES, FLAGS, summarise_results, values_of
+from cnpgen.benchmark.statistics import FIGURES, FLAGS, values_of
 from cnpgen.errors import MachineError
 from cnpgen.simulator.picture import save_picture
 from cnpgen.simulator.plant import as_plant
@@ -31,7 +31,7 @@ _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{paddi
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
 
 
-def save_report(benchmark: Benchmark, path: str | Path) -> Path:
+def save_benchmark_report(benchmark: Benchmark, path: str | Path) -> Path:
     """Write the report of a benchmark; a file that is there is replaced.
 
     Args:
@@ -70,7 +70,7 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
         benchmark: What ``run_benchmark`` returned.
         plant: The plant whose executions count; none if it is empty.
     """
-    summary = summarise_results(benchmark.results, plant)
+    summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
     rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
     for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):

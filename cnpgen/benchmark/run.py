@@ -14,6 +14,7 @@ from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.process import Attempt, PlannerProcess
 from cnpgen.benchmark.results import Results, answer_from_dict, answer_to_dict, open_results
+from cnpgen.benchmark.statistics import summarise_results
 from cnpgen.benchmark.suite import Suite, load_suite
 from cnpgen.errors import UsageError, nearest
 from cnpgen.judges.plans.verdict import Verdict
@@ -51,6 +52,14 @@ class Benchmark:
 
     def __repr__(self) -> str:
         return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
+
+    def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+        """Return ratios, medians, quartiles and p-values of every planner; see ``summarise_results``.
+
+        Args:
+            plant: The plant whose executions count; none by default.
+        """
+        return summarise_results(self.results, plant)
 
 
 def run_benchmark(

@@ -70,10 +70,10 @@ def summarise_results(
         plant: The plant whose executions count; none by default.
 
     Returns:
-        Planner -> ``{"ratios": ..., "figures": ...}``. A ratio has ``count``, ``of`` and ``share``, a figure
-        ``median``, ``q1``, ``q3`` and ``of``, of how many problems it is known. Both have ``p``, the probability of as large a
-        difference from the reference planner by chance: by McNemar's exact test, and by Wilcoxon's signed ranks over
-        the problems that both have a figure of.
+        Planner -> ``{"ratios": ..., "figures": ...}``. A ratio has ``count``, ``of`` and ``share``; a figure has
+        ``median``, ``q1``, ``q3`` and ``of``, of how many problems it is known. Both have ``p``, the probability of
+        as large a difference from the reference planner by chance: by McNemar's exact test, and by Wilcoxon's signed
+        ranks over the problems that both have a figure of.
     """
     values = {name: [values_of(row, plant) for row in rows] for name, rows in results.items()}
     reference = REFERENCE if REFERENCE in values else next(iter(values), "")

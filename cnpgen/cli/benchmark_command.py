@@ -43,7 +43,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.benchmark.report import save_report
+    from cnpgen.benchmark.report import save_benchmark_report
     from cnpgen.errors import UsageError
 
     if arguments.list:
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--plant says which robot executes plans: it goes with --simulate only")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
-    report = save_report(found, folder / "report.html")
+    report = save_benchmark_report(found, folder / "report.html")
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
     return 0
@@ -94,7 +94,6 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
     """Return for JSON what is said of all planners."""
     from cnpgen.benchmark.results import FORMAT, FORMAT_VERSION
-    from cnpgen.benchmark.statistics import summarise_results
 
     return {
         "format": FORMAT,
@@ -103,7 +102,7 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
         "suite_version": found.suite.version,
         "problems": len(found.problems),
         "folder": str(folder),
-        "planners": {plant or "planned": summarise_results(found.results, plant) for plant in found.plants or ("",)},
+        "planners": {plant or "planned": found.summary(plant) for plant in found.plants or ("",)},
     }
 
 

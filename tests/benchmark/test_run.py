@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.benchmark.report import save_report
+from cnpgen.benchmark.report import save_benchmark_report
 from cnpgen.benchmark.results import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run import run_benchmark
 from cnpgen.benchmark.suite import load_suite
@@ -88,7 +88,7 @@ def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) ->
     assert all(row["executed"]["nominal"]["scored"] for row in again.results["cnp-b"])
     third = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=3, plants=["nominal"], workers=1)
     assert third.results == again.results
-    report = save_report(third, tmp_path / "report.html").read_text()
+    report = save_benchmark_report(third, tmp_path / "report.html").read_text()
     assert "paper: 100 %" in report
     assert "<svg" in report
 
