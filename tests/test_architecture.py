@@ -30,7 +30,7 @@ MOST_ROOMS = 28  # more than anybody keeps in mind need a reason: the simulator 
 # What a room must not import although it stands on a floor below: judges share no code with what they judge.
 SOLVERS = ("symbolic", "kernels", "pipelines", "losses", "refine", "planner")
 APART = {"judges": SOLVERS, "world": SOLVERS, "simulator": SOLVERS}
-HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp", "mujoco", "imageio")
+HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp", "mujoco", "imageio", "ompl")
 FRAMEWORKS = ("torch", "jax", "tensorflow")
 BRIDGES = ("interop.tensorflow",)  # those of one file; users import them
 MODULES = sorted(

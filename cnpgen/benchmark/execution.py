@@ -47,4 +47,4 @@ def execution_of(problem: Plans, answer: Plans | Trajectory, plant: Plant) -> tu
     else:
         reference = make_reference(answer.states, answer.duration, acceleration_limit=limit)
     scene = scene_of(problem, plant)
-    return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0])
+    return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0], problem.boundary.start_dq[0])

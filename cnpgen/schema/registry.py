@@ -58,6 +58,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "solve": "cnpgen.benchmark.planners.solve:Solve",
         "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
         "aqp": "cnpgen.benchmark.planners.aqp:AQP",
+        "cbirrt": "cnpgen.benchmark.planners.cbirrt:CBiRRT",
     },
 }
 

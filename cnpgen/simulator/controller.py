@@ -16,7 +16,8 @@ GAIN = 80.0  # rad/s: where an error that is left alone would be gone after 1/80
 class Controller:
     """Computed torque, within the rated torques: ``M(q) (ddq* + w^2 (q* - q) + 2 w (dq* - dq)) + h(q, dq)``.
 
-    w is ``GAIN``. It knows neither friction nor damping, nor what a plant has besides.
+    w is ``GAIN``. Where a torque would be beyond its limit, the acceleration is made smaller and keeps its direction:
+    what holds the arm up comes first. It knows neither friction nor damping, nor what a plant has besides.
 
     Args:
         robot: The robot as the controller believes it to be.
@@ -44,6 +45,10 @@ class Controller:
         import pinocchio as pin
 
         towards = wanted[2] + GAIN**2 * (wanted[0] - q) + 2 * GAIN * (wanted[1] - dq)
-        torque = np.clip(pin.rnea(self._model, self._data, q, dq, towards), -self.limit, self.limit)
+        holding = np.clip(pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)), -self.limit, self.limit)
+        pushing = pin.rnea(self._model, self._data, q, dq, towards) - holding
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.nanmin((self.limit - np.sign(pushing) * holding) / np.abs(pushing))
+        torque = holding + min(share, 1.0) * pushing
         self._waiting.extend([torque] * (self._delay + 1 - len(self._waiting)))  # at the first tick it holds already
         return self._waiting.popleft()

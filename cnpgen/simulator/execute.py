@@ -77,19 +77,20 @@ def _compiled(text: str) -> Any:
     return load_mujoco().MjModel.from_xml_string(text)
 
 
-def execute(scene: Scene, reference: Reference, goal_xyz: Array) -> Execution:
+def execute(scene: Scene, reference: Reference, goal_xyz: Array, start_dq: Array | None = None) -> Execution:
     """Execute one plan.
 
     Args:
         scene: The world.
-        reference: What the controller is to follow; the robot begins in its first state.
+        reference: What the controller is to follow; the robot begins at its first position.
         goal_xyz: Where the tip must be at the end of the plan [m], shape (3,).
+        start_dq: The robot's velocities at the start [rad/s], shape (n,); those of the reference by default.
 
     Raises:
         RecipeError: As ``compile_scene`` does.
         MachineError: Likewise.
     """
-    return _Run(scene, reference, goal_xyz).execution()
+    return _Run(scene, reference, goal_xyz).execution(reference.dq[0] if start_dq is None else start_dq)
 
 
 class _Run:
@@ -106,10 +107,10 @@ class _Run:
         self._seen: list[tuple[Array, ...]] = []
         self._deepest = 0.0  # m
 
-    def execution(self) -> Execution:
+    def execution(self, start_dq: Array) -> Execution:
         """Run to the end."""
         data, n = self._data, self._n
-        data.qpos[:n], data.qvel[:n] = self._reference.q[0], self._reference.dq[0]
+        data.qpos[:n], data.qvel[:n] = self._reference.q[0], start_dq
         if self._scene.puck is not None:
             data.qpos[n:] = self._scene.puck
         self._mujoco.mj_forward(self._model, data)

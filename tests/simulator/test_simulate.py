@@ -147,3 +147,14 @@ def test_the_robot_stops_after_a_hit_within_its_limits(hit: Plans) -> None:
     assert np.all(np.abs(reference.ddq[after]) <= limit * (1 + 1e-12))
     step = np.diff(reference.q, axis=0) - TICK * (reference.dq[1:] + reference.dq[:-1]) / 2
     assert np.abs(step).max() < 1e-5  # positions and velocities belong together, across the end of the plan as well
+
+
+def test_where_a_torque_saturates_the_arm_is_still_held_up() -> None:
+    """A jump of a tenth of a radian asks for more than the motors have; the robot arrives, late, and does not fall."""
+    scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
+    q = np.vstack([reference.q[-1:] - 0.1, np.repeat(reference.q[-1:], 2000, axis=0)])
+    jump = Reference(q, np.zeros_like(q), np.zeros_like(q), 2.0)
+    away = replace(scene, tops=scene.tops - 2)
+    found = execute(away, jump, stored("transport").columns["goal_xyz"][0])
+    assert found.executed.torque_use == pytest.approx(1)
+    assert found.executed.finished

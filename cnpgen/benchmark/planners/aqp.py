@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.plane import PlanePath, stopping_path, striking_path
+from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
@@ -50,14 +51,14 @@ class _Follower:
 
     def __init__(self, robot: Robot, task: Plans) -> None:
         self._robot, self._boundary = robot, task.boundary
-        self._data, self._tip = robot.model.createData(), robot.model.getFrameId(robot.tip)
+        self._tip = Tip(robot)
         self._goal = task.columns["goal_xyz"][0]
         self._weights = np.array(WEIGHTS[: robot.n])
 
     def plan(self, height: float) -> Trajectory | None:
         """Plan as fast a hit as can be followed, down to a third of the speed that was asked for."""
-        _, velocity = self._at(self._boundary.goal_q[0], self._boundary.goal_dq[0])
-        start, _ = self._at(self._boundary.start_q[0], self._boundary.start_dq[0])
+        start, _, _ = self._tip.at(self._boundary.start_q[0])
+        velocity = self._tip.at(self._boundary.goal_q[0])[2][:3] @ self._boundary.goal_dq[0]
         speed = float(np.linalg.norm(velocity[:2]))
         if speed == 0:
             raise UsageError("it plans hits, and this motion ends at rest")
@@ -102,26 +103,14 @@ class _Follower:
 
     def _velocity(self, q: Array, wanted: Array, period: float, towards: Array) -> Array | None:
         """Solve for the joint velocity that brings the tip to where it is wanted, nearest to the anchor's."""
-        import pinocchio as pin
-
-        robot, frame = self._robot, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        J = pin.computeFrameJacobian(robot.model, self._data, q, self._tip, frame)[:3]
-        tip = pin.updateFramePlacement(robot.model, self._data, self._tip).translation
+        robot, (tip, _, J) = self._robot, self._tip.at(q)
+        J = J[:3]
         least = J.T @ np.linalg.solve(J @ J.T, (wanted - tip) / period)
         null = np.linalg.svd(J)[2][3:].T
         low = np.maximum(-robot.velocity_limit, (ROOM * robot.position_lower - q) / period)
         high = np.minimum(robot.velocity_limit, (ROOM * robot.position_upper - q) / period)
         along = nearest_in_null_space(null, self._weights, least - towards, (low - least, high - least))
         return None if along is None else np.asarray(least + null @ along)
-
-    def _at(self, q: Array, dq: Array) -> tuple[Array, Array]:
-        """Position [m] and velocity [m/s] of the tip, shape (3,) each."""
-        import pinocchio as pin
-
-        model, frame = self._robot.model, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        J = pin.computeFrameJacobian(model, self._data, q, self._tip, frame)
-        pose = pin.updateFramePlacement(model, self._data, self._tip)
-        return np.array(pose.translation), np.asarray(J[:3] @ dq)
 
 
 def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]) -> Array | None:
