@@ -8,6 +8,8 @@ from cnpgen.benchmark.suite import Draws as Draws
 from cnpgen.benchmark.suite import Suite as Suite
 from cnpgen.benchmark.suite import load_suite as load_suite
 from cnpgen.benchmark.trajectory import Trajectory as Trajectory
+from cnpgen.benchmark.turns import Lead as Lead
+from cnpgen.benchmark.turns import Turns as Turns
 from cnpgen.errors import CnpgenError as CnpgenError
 from cnpgen.errors import DatasetError as DatasetError
 from cnpgen.errors import MachineError as MachineError

@@ -20,11 +20,13 @@ from cnpgen.problems.robot import load_robot
 from cnpgen.schema.keys import Range, field
 
 Array = NDArray[np.float64]
+State = tuple[Array, Array, Array]
+"""Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of N arms, shape (N, n) each."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pucks:
-    """A grid of pucks, each hit from rest in the base configuration, as fast as the arm can."""
+    """A grid of pucks, each hit as fast as the arm can."""
 
     problem: Problem = field("the problem", form="name or path of a problem")
     x: Range = field("where the pucks lie along world x, both ends included", unit="m")
@@ -41,36 +43,47 @@ class Pucks:
 
 
 def hits_of(pucks: Pucks) -> Plans:
-    """Return the boundary problems of hitting every puck of a grid.
-
-    The goal configuration is the one from which the tip can move fastest along the hit, near the base configuration,
-    and the goal velocity is the fastest one (docs/references.md, 2).
+    """Return the boundary problems of hitting every puck of a grid from rest in the base configuration.
 
     Raises:
         RecipeError: The problem has no table, or a puck cannot be hit.
     """
-    robot = load_robot(pucks.problem)
-    table = next((each for each in pucks.problem.constraint if isinstance(each, Table)), None)
-    if table is None:
-        raise RecipeError([f"pucks.problem: {pucks.problem.name} has no table to put pucks on"])
     puck = pucks.positions()
+    start_q = np.tile(load_robot(pucks.problem).base, (puck.shape[1], 1))
+    still = np.zeros_like(start_q)
+    return hits_from(pucks, puck, (start_q, still, still))
+
+
+def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
+    """Return the boundary problems of hitting N pucks, each from a state of its own.
+
+    The goal configuration is the one from which the tip can move fastest along the hit, near the configuration of the
+    start, and the goal velocity is the fastest one (docs/references.md, 2).
+
+    Args:
+        pucks: The problem, and what is asked of hits.
+        puck: Where the pucks lie [m], shape (2, N).
+        start: Where the arm is at the start, and how it moves.
+
+    Raises:
+        RecipeError: The problem has no table, or a puck cannot be hit.
+    """
+    robot, problem = load_robot(pucks.problem), pucks.problem
+    table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+    if table is None:
+        raise RecipeError([f"pucks.problem: {problem.name} has no table to put pucks on"])
     way = np.array(pucks.goal)[:, None] - puck
     along = way / np.linalg.norm(way, axis=0)
     draws = Round(puck.shape[1])
     draws["goal_xyz"] = np.vstack([puck - pucks.behind * along, np.full(draws.size, table.z)])
     draws["hit_angle"] = np.arctan2(along[1], along[0])[None]
-    context = Context(pucks.problem, robot, problem_kernels(pucks.problem, robot, *choose_backend(None)), "float64")
-    for stage in (HittingConfiguration(near="base"), HittingVelocity(full_speed=1.0)):
+    draws["start_q"] = np.ascontiguousarray(start[0].T)
+    context = Context(problem, robot, problem_kernels(problem, robot, *choose_backend(None)), "float64")
+    for stage in (HittingConfiguration(near="start"), HittingVelocity(full_speed=1.0)):
         stage.prepare(context)(draws, np.random.default_rng(0))
     if len(draws.alive) < draws.size:
         raise RecipeError([f"pucks: {draws.size - len(draws.alive)} of {draws.size} cannot be hit"])
-    return _plans(pucks.problem, {name: values.T for name, values in draws.columns.items()}, robot.base)
-
-
-def _plans(problem: Problem, columns: dict[str, Array], base: Array) -> Plans:
-    """Add the start at rest to the goals."""
-    record, rows = record_problem(problem), len(columns["goal_q"])
-    start_q, still = np.tile(base, (rows, 1)), np.zeros((rows, len(base)))
-    start = {"start_q": start_q, "start_dq": still, "start_ddq": still, "start_xyz": record.tip_positions(start_q)}
-    plain = {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed")}
-    return plans_of_rows(record, {**columns, **plain, **start}, source="pucks on a grid")
+    record, columns = record_problem(problem), {name: values.T for name, values in draws.columns.items()}
+    columns |= {"start_q": start[0], "start_dq": start[1], "start_ddq": start[2]}
+    columns |= {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed")}
+    return plans_of_rows(record, {**columns, "start_xyz": record.tip_positions(start[0])}, source="pucks on a grid")

@@ -121,11 +121,11 @@ def _pictures(benchmark: Benchmark, folder: Path) -> list[str]:
         index = next((row["problem"] for row in rows if row["answer"] is not None), None)
         if index is None:
             continue
-        problem = benchmark.problems[index]
+        problem, lead = benchmark.problems[index], benchmark.lead and benchmark.lead[index]
         answer = answer_from_dict(problem, rows[index]["answer"])
         file = folder / f"{name}.png"
         try:
-            scene, reference, execution = execution_of(problem, answer, as_plant(benchmark.plants[0]))
+            scene, reference, execution = execution_of(problem, answer, lead, as_plant(benchmark.plants[0]))
             save_picture(file, scene, execution, reference.ticks)
         except MachineError as error:
             return [f"<p>No pictures: {escape(str(error))}</p>"]

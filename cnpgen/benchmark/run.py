@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.execution import execute_answer
+from cnpgen.benchmark.execution import Task, execute_answer
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.process import Attempt, PlannerProcess
 from cnpgen.benchmark.results import Results, answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.statistics import summarise_results
 from cnpgen.benchmark.suite import Suite, load_suite
+from cnpgen.benchmark.turns import Lead
 from cnpgen.errors import UsageError, nearest
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.versions import __version__
@@ -41,12 +42,14 @@ class Benchmark:
     Attributes:
         suite: The suite.
         problems: Its problems.
+        lead: Of turns, the first motions that lead to them.
         results: Planner -> its rows, one for each problem, in their order (docs/benchmark.md).
         plants: The plants that plans were executed on in this run.
     """
 
     suite: Suite
     problems: Plans
+    lead: Lead | None
     results: dict[str, list[dict[str, Any]]]
     plants: tuple[str, ...] = ()
 
@@ -104,7 +107,7 @@ def run_benchmark(
     limit = number("time_limit", time_limit)
     if limit <= 0:
         raise UsageError(f"time_limit must be above 0 s, got {time_limit:g} s")
-    problems = loaded.problems(None if n is None else integer("n", n, least=1))
+    problems, lead = loaded.problems(None if n is None else integer("n", n, least=1))
     setting = Setting(problems.problem, loaded.model, limit)
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
@@ -114,9 +117,11 @@ def run_benchmark(
         results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), discard=force)
         _plan_all(results, name, setting, problems, tell)
         for plant in robots:
-            _execute_all(results, f"{name}, {plant.name} plant", plant, problems, workers=workers, tell=tell)
+            _execute_all(
+                results, plant, problems, lead, workers=workers, tell=partial(tell, f"{name}, {plant.name} plant")
+            )
         rows[name] = [results.rows[index] for index in range(len(problems))]
-    return Benchmark(loaded, problems, rows, tuple(plant.name for plant in robots))
+    return Benchmark(loaded, problems, lead, rows, tuple(plant.name for plant in robots))
 
 
 def _check_planners(planners: Sequence[str]) -> None:
@@ -190,15 +195,25 @@ def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
 
 
 def _execute_all(
-    results: Results, title: str, plant: Plant, problems: Plans, *, workers: int | None, tell: Progress
+    results: Results,
+    plant: Plant,
+    problems: Plans,
+    lead: Lead | None,
+    *,
+    workers: int | None,
+    tell: Callable[[int, int], None],
 ) -> None:
     """Execute the plans that were not executed on this plant yet."""
     waiting = list(results.unexecuted(plant.name, len(problems)))
     if not waiting:
         return
-    tasks = ((problems[index], answer_from_dict(problems[index], results.rows[index]["answer"])) for index in waiting)
+    tasks = (_task(problems[index], results.rows[index], lead and lead[index]) for index in waiting)
     count = worker_count(workers, len(waiting))
     with closing(share_out(partial(execute_answer, plant=plant), tasks, count, ordered=True)) as found:
         for done, (index, executed) in enumerate(zip(waiting, found, strict=True), start=1):
             results.append({"problem": index, "executed": {plant.name: executed.to_dict()}})
-            tell(title, len(waiting), done)
+            tell(len(waiting), done)
+
+
+def _task(problem: Plans, row: dict[str, Any], lead: Lead | None) -> Task:
+    return problem, answer_from_dict(problem, row["answer"]), lead

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cnpgen.benchmark.pucks import Pucks, hits_of
+from cnpgen.benchmark.turns import Lead, Turns, turns_of
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.plans.plans import Plans
@@ -35,29 +36,35 @@ class Suite:
     version: str = field("semantic version; other problems need another", pattern=r"^\d+\.\d+\.\d+$")
     title: str = field("one line about it", default="")
     model: str = field("the shipped model that plans for such problems", default="")
-    pucks: Pucks | None = field("a grid of pucks to hit", default=None)
+    pucks: Pucks | None = field("a grid of pucks to hit from rest", default=None)
+    turns: Turns | None = field("pucks to hit on the way to others", default=None)
     draws: Draws | None = field("random problems of a dataset", default=None)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""
-        if (self.pucks is None) == (self.draws is None):
-            yield "pucks", "expected either [pucks] or [draws], and not both"
+        if sum(part is not None for part in (self.pucks, self.turns, self.draws)) != 1:
+            yield "pucks", "expected exactly one of [pucks], [turns] and [draws]"
 
-    def problems(self, n: int | None = None) -> Plans:
+    def problems(self, n: int | None = None) -> tuple[Plans, Lead | None]:
         """Return the boundary problems, as plans that are still to be made.
 
         Args:
             n: The first so many; of draws it may be more than the recipe says.
+
+        Returns:
+            The problems and, of turns, the first motions that lead to them.
 
         Raises:
             RecipeError: A recipe that it names has mistakes.
             UsageError: ``n`` is no positive number.
         """
         if self.draws is not None:
-            return draw_boundary_problems(self.draws.recipe, n or self.draws.n, seed=self.draws.seed)
+            return draw_boundary_problems(self.draws.recipe, n or self.draws.n, seed=self.draws.seed), None
+        if self.turns is not None:
+            found, lead = turns_of(self.turns)
+            return found[:n], lead
         assert self.pucks is not None
-        found = hits_of(self.pucks)
-        return found if n is None else found[:n]
+        return hits_of(self.pucks)[:n], None
 
 
 def load_suite(name_or_path: str | Path) -> Suite:

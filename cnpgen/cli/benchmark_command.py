@@ -112,7 +112,7 @@ def _text(found: "Benchmark") -> str:
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
-    tables = [table(table_rows(found, plant), indent="  ", one_line=True) for plant in found.plants or ("",)]
+    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.plants or ("",)]
     return "\n\n".join([head, *("\n".join(lines) for lines in tables)])
 
 

@@ -11,7 +11,7 @@ MARKS: dict[Kind, set[str]] = {
     "problem": {"robot", "constraint", "limits"},
     "pipeline": {"stage", "problem"},
     "dataset": {"splits", "pipeline"},
-    "suite": {"pucks", "draws"},
+    "suite": {"pucks", "turns", "draws"},
 }
 """Top-level keys that only files of a kind have."""
 

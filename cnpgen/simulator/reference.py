@@ -49,12 +49,17 @@ def reference_of(motion: Motion, *, acceleration_limit: Array) -> Reference:
     Raises:
         UsageError: The plan never arrives, or takes longer than ``LONGEST``.
     """
+    return make_reference(states_of(motion), float(motion.duration()[0]), acceleration_limit=acceleration_limit)
+
+
+def states_of(motion: Motion) -> StatesAt:
+    """Return what evaluates one motion in time."""
 
     def states(t: Array) -> tuple[Array, Array, Array]:
         found = motion.at(motion.phase_at(t[None]))
         return found.q[0], found.dq[0], found.ddq[0]
 
-    return make_reference(states, float(motion.duration()[0]), acceleration_limit=acceleration_limit)
+    return states
 
 
 def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Array) -> Reference:

@@ -20,7 +20,7 @@ from cnpgen.plans import Plans, open_problem
 
 
 def one_of(suite: str, index: int = 0) -> Plans:
-    return load_suite(suite).problems(index + 1)[index]
+    return load_suite(suite).problems(index + 1)[0][index]
 
 
 def transcription(task: Plans) -> Transcription:

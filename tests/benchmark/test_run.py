@@ -117,7 +117,7 @@ def test_a_planner_for_other_problems_is_refused_with_its_reason(tmp_path: Path)
 
 
 def test_answers_read_back_as_they_were(tmp_path: Path) -> None:
-    problem = load_suite("hits-81").problems(1)
+    problem = load_suite("hits-81").problems(1)[0]
     trajectory = Trajectory(problem.boundary.start_q[0, :2] * 0 + [0.0, 1 / 3], problem.boundary.start_q[[0, 0]] / 3)
     results = open_results(tmp_path / "a.jsonl", {})
     results.append({"problem": 0, "ending": "planned", "answer": answer_to_dict(trajectory)})

@@ -84,7 +84,7 @@ def test_jumps_in_the_velocity_of_a_linear_trajectory_are_seen_as_accelerations(
 def test_a_plan_and_its_samples_are_executed_alike() -> None:
     pytest.importorskip("mujoco")
     plan = stored("hit")
-    one, other = (execute_answer((plan, each), plant=PLANTS["nominal"]) for each in (plan, sampled(plan, 400)))
+    one, other = (execute_answer((plan, each, None), plant=PLANTS["nominal"]) for each in (plan, sampled(plan, 400)))
     assert other.hit_time == one.hit_time
     assert other.puck_speed == pytest.approx(one.puck_speed, rel=1e-3)
     assert other.z_error == pytest.approx(one.z_error, rel=0.02)
@@ -94,6 +94,6 @@ def test_what_cannot_be_executed_says_so() -> None:
     pytest.importorskip("mujoco")
     plan = stored("transport")
     slow = sampled(plan, 10)
-    found = execute_answer((plan, Trajectory(slow.t * 1000, slow.q)), plant=PLANTS["nominal"])
+    found = execute_answer((plan, Trajectory(slow.t * 1000, slow.q), None), plant=PLANTS["nominal"])
     assert "cannot be executed" in found.failure
     assert judge_answer(plan, Trajectory(slow.t * 1000, slow.q)).reason == "too long"
