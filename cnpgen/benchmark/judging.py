@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.judges.plans.course import Course
 from cnpgen.judges.plans.judge import reason_of
-from cnpgen.judges.plans.measure import boundary_margins, by_name, constraint_margins
+from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
 from cnpgen.judges.plans.sampling import Samples
@@ -52,10 +52,10 @@ def _judge(problem: Plans, samples: Samples, states: Course) -> Verdict:
     tops = obstacle_tops(meaning, problem.columns["start_xyz"][0], goal_xyz)
     world = _world(problem.problem)
     world.set_path(states.q, states.dq, states.ddq, tops)
-    margins = [
-        *boundary_margins(states, problem.boundary, samples, robot.joint_names),
-        *constraint_margins(meaning, world, samples),
-    ]
+    start_tip = world.tip_position[:, 0]
+    margins = boundary_margins(states, problem.boundary, samples, robot.joint_names)
+    for constraint in meaning.constraint:
+        margins += [each.margin(meaning, samples) for each in measure(constraint, world, samples.s, start_tip)]
     metrics = metrics_of(meaning, world, samples, np.full_like(states.q, np.nan))
     paper = paper_rule(meaning, world, tops, goal_xyz)
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.t))
