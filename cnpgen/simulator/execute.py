@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 NEAR = 0.01  # m: how far from the goal a motion has finished, as the paper counts
 LEFT = 0.03  # m: a touch with more of the way left than this is an early one
 MOVING = 0.02  # m/s: a puck that is slower lies
-DEEP = 2e-3  # m: deeper in an obstacle is a collision
+DEEP = 1e-3  # m: deeper in an obstacle is a collision
 WAIT = 4.0  # s: how long a puck may take to arrive
 SETTLE = 0.2  # s: how long is watched after a motion without a puck
 

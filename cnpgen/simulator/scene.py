@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import Joint
@@ -105,9 +106,16 @@ def _arm(scene: Scene) -> Iterator[str]:
     yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
     yield '<site name="tip" size="0.001"/><geom name="mallet" type="sphere" size="0.001"/>'
     if scene.problem.object_size is not None:
-        size = _numbers(np.array(scene.problem.object_size) / 2)
+        size = _numbers(np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem))
         yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
     yield "</body>" * (len(names) + 1)
+
+
+def _legal_depth(problem: Problem) -> float:
+    """Return how deep in an obstacle a valid plan may carry the object [m]: so much smaller is what collides."""
+    return max(
+        (each.depth + each.tolerance for each in problem.constraint if isinstance(each, ObjectContact)), default=0.0
+    )
 
 
 def _inertial(joint: Joint, mass: float) -> str:
