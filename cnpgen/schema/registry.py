@@ -59,6 +59,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
         "aqp": "cnpgen.benchmark.planners.aqp:AQP",
         "cbirrt": "cnpgen.benchmark.planners.cbirrt:CBiRRT",
+        "sst": "cnpgen.benchmark.planners.sst:SST",
     },
 }
 
