@@ -1,3 +1,15 @@
+from cnpgen.benchmark.planner import BenchmarkPlanner as BenchmarkPlanner
+from cnpgen.benchmark.planner import Setting as Setting
+from cnpgen.benchmark.pucks import Pucks as Pucks
+from cnpgen.benchmark.report import save_benchmark_report as save_benchmark_report
+from cnpgen.benchmark.run import Benchmark as Benchmark
+from cnpgen.benchmark.run import run_benchmark as run_benchmark
+from cnpgen.benchmark.suite import Draws as Draws
+from cnpgen.benchmark.suite import Suite as Suite
+from cnpgen.benchmark.suite import load_suite as load_suite
+from cnpgen.benchmark.trajectory import Trajectory as Trajectory
+from cnpgen.benchmark.turns import Lead as Lead
+from cnpgen.benchmark.turns import Turns as Turns
 from cnpgen.errors import CnpgenError as CnpgenError
 from cnpgen.errors import DatasetError as DatasetError
 from cnpgen.errors import MachineError as MachineError
@@ -84,6 +96,10 @@ from cnpgen.robots.spec import LimitSpec as LimitSpec
 from cnpgen.robots.spec import Obstacle as Obstacle
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
+from cnpgen.simulator.executed import Executed as Executed
+from cnpgen.simulator.plant import Plant as Plant
+from cnpgen.simulator.simulate import Simulation as Simulation
+from cnpgen.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.store.blueprint import Blueprint as Blueprint
 from cnpgen.store.blueprint import ShardTask as ShardTask
 from cnpgen.store.blueprint import StoredProblem as StoredProblem

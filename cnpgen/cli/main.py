@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cnpgen.cli import (
+    benchmark_command,
     complete_command,
     doctor_command,
     evaluate_command,
@@ -24,6 +25,7 @@ from cnpgen.cli import (
     plan_command,
     refine_command,
     show_command,
+    simulate_command,
     solve_command,
     train_command,
     validate_command,
@@ -49,6 +51,8 @@ _COMMANDS = (
     solve_command,
     refine_command,
     evaluate_command,
+    simulate_command,
+    benchmark_command,
     export_command,
     doctor_command,
 )
@@ -67,6 +71,8 @@ examples:
   cnpgen complete airhockey-replan pucks.csv -o problems.h5; what is solved, refined or planned for
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
+  cnpgen simulate plans.h5 --video plan.mp4          execute them in MuJoCo
+  cnpgen benchmark hits-81 --simulate                compare planners
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
 
 stdout is data, stderr everything else. Exit codes:

@@ -20,6 +20,7 @@ _LAYOUT: dict[Kind, str] = {  # where the shipped files of a kind are
     "problem": "problems/*/problem.toml",
     "pipeline": "pipelines/*.toml",
     "dataset": "datasets/*.toml",
+    "suite": "datasets/suites/*.toml",
 }
 
 

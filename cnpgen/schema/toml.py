@@ -5,12 +5,13 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-Kind = Literal["problem", "pipeline", "dataset"]
+Kind = Literal["problem", "pipeline", "dataset", "suite"]
 
 MARKS: dict[Kind, set[str]] = {
     "problem": {"robot", "constraint", "limits"},
     "pipeline": {"stage", "problem"},
     "dataset": {"splits", "pipeline"},
+    "suite": {"pucks", "turns", "draws"},
 }
 """Top-level keys that only files of a kind have."""
 

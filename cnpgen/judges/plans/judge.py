@@ -16,13 +16,12 @@ from cnpgen.judges.plans.closer import look_closer
 from cnpgen.judges.plans.course import course, jerks
 from cnpgen.judges.plans.limits import is_proven, limit_margin
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
+from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
 from cnpgen.judges.plans.peaks import look_at_peaks
 from cnpgen.judges.plans.sampling import Samples, sample, time_table
 from cnpgen.judges.plans.survey import Survey, survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
-from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -177,10 +176,10 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     ends = boundary_margins(states, plan.boundary, samples, world.robot.joint_names)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
-        metrics = _metrics(plan, world, samples)
+        metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
     margins = [*ends, *_margins(survey(plan.problem, plan.motion, plan.tops, world, samples, table))]
-    return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
+    return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
 def _margins(survey: Survey) -> list[Margin]:
@@ -226,32 +225,11 @@ def _samples(plan: _Plan, step: float) -> tuple[Samples, Array] | Verdict:
     return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
 
 
-def _reason(margins: list[Margin]) -> str:
-    """Why a plan is not valid: its boundary conditions first, then the constraint that is broken worst."""
+def reason_of(margins: list[Margin]) -> str:
+    """Say why a plan is not valid: its boundary conditions first, then the constraint that is broken worst."""
     broken = [margin for margin in margins if not margin.ok]
     if not broken:
         return Reason.OK
     if any(margin.reason == Reason.BOUNDARY for margin in broken):
         return Reason.BOUNDARY
     return max(broken, key=lambda margin: margin.severity).reason
-
-
-def _metrics(plan: _Plan, world: PathWorld, samples: Samples) -> Metrics:
-    problem, robot = plan.problem, world.robot
-    jerk = jerks(plan.motion, samples.s)
-    share = world.torque / robot.torque_limit[:, None]
-    table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
-    upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
-    return Metrics(
-        duration=float(samples.t[-1]),
-        effort=samples.integral(np.sum(share**2, axis=0)),
-        jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
-        hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
-        z_error=np.nan if table is None else samples.integral(np.abs(world.tip_position[2] - table.z)),
-        vertical_error=samples.integral(_tilt(world.tip_rotation)) if upright else np.nan,
-    )
-
-
-def _tilt(R: Array) -> Array:
-    """|roll| + |pitch| of rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` [rad], shape (3, 3, K) -> (K,)."""
-    return np.asarray(np.abs(np.arctan2(R[2, 1], R[2, 2])) + np.abs(np.arctan2(R[2, 0], np.hypot(R[2, 1], R[2, 2]))))
