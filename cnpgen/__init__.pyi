@@ -116,6 +116,7 @@ from cnpgen.training.train import Trained as Trained
 from cnpgen.training.train import train_model as train_model
 from cnpgen.trajectory.boundary import Boundary as Boundary
 from cnpgen.trajectory.fit import fit_motion as fit_motion
+from cnpgen.trajectory.joined import JoinedMotion as JoinedMotion
 from cnpgen.trajectory.motion import Motion as Motion
 from cnpgen.trajectory.motion import States as States
 from cnpgen.trajectory.spec import TrajectorySpec as TrajectorySpec
