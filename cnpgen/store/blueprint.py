@@ -194,7 +194,7 @@ def _check_sizes(blueprint: Blueprint) -> None:
     if count > MOST_SHARDS:
         raise UsageError(
             f"{count:,} shards of {blueprint.shard_size:,} rows are too many, expected at most {MOST_SHARDS:,}:"
-            " choose a larger shard_size"
+            " choose a larger shard_size="
         )
     if any(rows < 0 for rows in blueprint.splits.values()) or not any(blueprint.splits.values()):
         found = ", ".join(f"{name} {rows}" for name, rows in blueprint.splits.items())
