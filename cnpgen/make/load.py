@@ -97,9 +97,11 @@ def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
     Raises:
         RecipeError: It does not fit this version of cnpgen.
         PluginError: It needs packages that are not installed.
+        DatasetError: There is no recipe in it.
     """
+    urdf, _ = blueprint.problem.urdf, blueprint.stages
     with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-        yield restore_dataset_recipe(dict(blueprint.recipe), str(blueprint.robot["urdf"]), Path(folder))
+        yield restore_dataset_recipe(dict(blueprint.recipe), urdf, Path(folder))
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:

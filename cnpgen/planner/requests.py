@@ -95,7 +95,7 @@ def check_drawing(where: str, blueprint: Blueprint, model: Model, *, other: bool
     """Refuse rows of another problem, and if not ``other`` those drawn in another way than the training rows."""
     check_problem(where, as_record(blueprint.problem), model)
     trained = model.training.get("stages")
-    if other or trained is None or _drawing(trained) == _drawing(blueprint.recipe["pipeline"]["stage"]):
+    if other or trained is None or _drawing(trained) == _drawing(blueprint.stages):
         return
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(

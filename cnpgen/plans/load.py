@@ -174,7 +174,7 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
     try:
         same = record.comparable_sha256 == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
     except RecipeError as error:
-        raise DatasetError(f"{path} is damaged: its attribute 'problem_recipe': {error}") from error
+        raise DatasetError(f"{path} is damaged: its {error}") from error
     if not same:
         raise DatasetError(f"{path} is damaged: its problem was changed after it was written")
     return record

@@ -111,6 +111,8 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
     (path.parent / "robot.urdf").write_text(urdf, encoding="utf-8")
 
     def read(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
+        if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
+            raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
         value = {**value, "robot": {**value["robot"], "urdf": "robot.urdf"}}
         readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)

@@ -58,7 +58,7 @@ class ProblemRecord(StoredProblem):
             content: dict[str, Any] = parse_json(self.recipe)
             check_form(content, _FORM)
         except ValueError as error:
-            raise RecipeError([f"the recipe is not that of a problem: {error}"]) from error
+            raise RecipeError([f"problem_recipe is not that of a problem: {error}"]) from error
         return content
 
     @property
@@ -86,7 +86,7 @@ class ProblemRecord(StoredProblem):
             RecipeError: There is no such parameterisation.
         """
         mistakes: list[str] = []
-        where = Place("the recipe of the problem", "trajectory")
+        where = Place("problem_recipe", "trajectory")
         spec = parse(TrajectorySpec, self.content["trajectory"], where=where, mistakes=mistakes)
         if spec is None:
             raise RecipeError(mistakes)

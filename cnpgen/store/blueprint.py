@@ -12,7 +12,7 @@ from typing import Any
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import canonical_sha256, load_document, plain, save_document
-from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Maybe, check_form
+from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Form, Maybe, check_form
 from cnpgen.store.files.limits import MOST_COLUMNS, MOST_FIELDS, MOST_SHARDS
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
@@ -163,11 +163,29 @@ class Blueprint:
         Raises:
             DatasetError: The blueprint does not say.
         """
+        self._require({"pipeline": {"problem": {EVERY: ANYTHING}}}, "its problem")
+        urdf = self.robot.get("urdf")
+        if not isinstance(urdf, str):
+            raise DatasetError(f"the blueprint of {self.name} lacks the robot's URDF, and so does not say its problem")
+        return StoredProblem(json.dumps(self.recipe["pipeline"]["problem"], ensure_ascii=False), urdf)
+
+    @property
+    def stages(self) -> list[dict[str, Any]]:
+        """The resolved stages that draw the rows.
+
+        Raises:
+            DatasetError: The blueprint does not say.
+        """
+        self._require({"pipeline": {"stage": [{"use": TEXT}]}}, "how rows are drawn")
+        found: list[dict[str, Any]] = self.recipe["pipeline"]["stage"]
+        return found
+
+    def _require(self, form: Form, what: str) -> None:
+        """Refuse a recipe that does not say something."""
         try:
-            content, urdf = self.recipe["pipeline"]["problem"], self.robot["urdf"]
-        except KeyError as error:
-            raise DatasetError(f"the blueprint of {self.name} lacks {error}, and so does not say its problem") from None
-        return StoredProblem(json.dumps(content, ensure_ascii=False), str(urdf))
+            check_form(self.recipe, form)
+        except ValueError as error:
+            raise DatasetError(f"the blueprint of {self.name} does not say {what}: {error}") from error
 
     def field_named(self, name: str) -> Field:
         """Return the field called ``name``.
@@ -192,7 +210,7 @@ def _check_sizes(blueprint: Blueprint) -> None:
     if count > MOST_SHARDS:
         raise UsageError(
             f"{count:,} shards of {blueprint.shard_size:,} rows are too many, expected at most {MOST_SHARDS:,}:"
-            " choose a larger shard_size"
+            " choose a larger shard_size="
         )
     if any(rows < 0 for rows in blueprint.splits.values()) or not any(blueprint.splits.values()):
         found = ", ".join(f"{name} {rows}" for name, rows in blueprint.splits.items())

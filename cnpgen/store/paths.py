@@ -32,17 +32,21 @@ def require_file(path: Path, what: str, *, of_dataset: str = "") -> None:
         of_dataset: What to do if it is the folder of a dataset instead.
 
     Raises:
-        UsageError: It is not there, or is a folder.
+        UsageError: It is not there, or is a folder, a device or a pipe.
     """
     if path.is_dir():
         found, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
         raise UsageError(f"{path} is {found}, expected {what}{hint and f': {hint}'}")
     if not path.exists():
         raise UsageError(f"{path} is not there, expected {what}")
+    if not path.is_file():
+        raise UsageError(f"{path} is a device or a pipe, expected {what}")
 
 
 def file_kind(path: Path) -> str:
     """Say what a file is: "a model of cnpgen", "a file of plans"; nothing where that is not known."""
+    if not path.is_file():  # to open a pipe is to wait for somebody
+        return ""
     try:
         with path.open("rb") as file:
             head = file.read(64)

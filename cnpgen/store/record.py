@@ -52,7 +52,7 @@ class ShardRecord:
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
-FORM = {
+_FORM = {  # looked at where a record is rebuilt
     **dict.fromkeys(("file", "sha256", "plan_fingerprint", "started"), TEXT),
     **dict.fromkeys(("bytes", "rows", "first_sample_id"), WHOLE),
     "seconds": NUMBER,
@@ -79,7 +79,7 @@ def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
         DatasetError: A key is missing or has the wrong type.
     """
     try:
-        check_form(content, FORM)
+        check_form(content, _FORM)
         statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
         fates = fates_from_json(content["outcome"])
         return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, fates=fates)
@@ -105,7 +105,7 @@ def load_record(folder: Path, task: ShardTask) -> ShardRecord:
         MachineError: The system would not let us read it.
     """
     path = folder / task.sidecar
-    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION, form=FORM))
+    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION, form={}))
     found = (record.file, record.rows, record.first_sample_id)
     if found != (task.file, task.rows, task.first_row):
         raise DatasetError(f"{path} is the record of another shard: {found[0]}, {found[1]} rows from row {found[2]}")

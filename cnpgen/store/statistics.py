@@ -120,8 +120,8 @@ def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
     columns = len(found.mean)
     if found.count < 1 or any(array.shape != (columns,) for array in arrays.values()):
         raise ValueError(f"statistics must be of rows, and all of {columns} columns")
-    if counts is not None and (counts.ndim != 2 or len(counts) != columns):
-        raise ValueError(f"a histogram must have {columns} columns, got shape {counts.shape}")
+    if counts is not None and counts.shape != (columns, N_BINS):
+        raise ValueError(f"a histogram must have shape {(columns, N_BINS)}, got {counts.shape}")
     return found
 
 

@@ -172,6 +172,8 @@ def is_dataset(folder: Path) -> bool:
 
 def _is_ours(path: Path) -> bool:
     try:
+        if not path.is_file():  # to open a pipe is to wait for somebody
+            return False
         with path.open("rb") as file:
             return _MARK.match(file.read(64)) is not None
     except OSError:

@@ -9,7 +9,6 @@ from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import BOUNDARY
-from cnpgen.store.blueprint import Blueprint
 from cnpgen.training.rows import boundary_columns
 from cnpgen.trajectory.boundary import Boundary
 
@@ -91,8 +90,3 @@ def open_training_data(folder: str | Path) -> TrainingData:
     if dataset.splits[validation] < 2:
         raise DatasetError(f"{folder} has 1 row in {validation!r}: models are compared by some and judged on others")
     return TrainingData(dataset, train, validation)
-
-
-def stages_of(blueprint: Blueprint) -> list[dict[str, Any]]:
-    """Return how the rows of a dataset were drawn."""
-    return list(blueprint.recipe["pipeline"]["stage"])

@@ -17,7 +17,7 @@ from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
-from cnpgen.training.data import TrainingData, stages_of
+from cnpgen.training.data import TrainingData
 from cnpgen.training.rows import Rows, prepare_rows, resting
 from cnpgen.training.run import Run
 from cnpgen.training.score import validate
@@ -66,7 +66,7 @@ def prepare_run(
         problem=given.record,
         validate=lambda model: validate(model, kit, held_out),
         rest=rest,
-        training={"command": command, **identity(source, settings), "stages": stages_of(source.dataset.blueprint)},
+        training={"command": command, **identity(source, settings), "stages": source.dataset.blueprint.stages},
     )
     return run, kit
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, counted
-from cnpgen.judges.rows.hits import HitRule, hit_rule, repeated_share, shares_of
+from cnpgen.judges.rows.hits import hit_rule, repeated_share, shares_of
 from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
@@ -104,7 +104,7 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
     with restored(blueprint) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
-        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype, rule=_rule(blueprint))
+        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype, rule=hit_rule(blueprint.stages))
         plans = check_plans(problem, robot, columns)
     problems = [*plans.problems, *check_numbers(blueprint, task, columns, record)]
     problems += [
@@ -117,15 +117,10 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
     return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, shares)
 
 
-def _rule(blueprint: Blueprint) -> HitRule:
-    """Return what the recorded stages say of the goals of hits."""
-    return hit_rule(blueprint.recipe["pipeline"]["stage"])
-
-
 def _slowed_down(blueprint: Blueprint, checks: list[_ShardCheck]) -> list[str]:
     """Say that more hits have the same fraction of their highest speed than luck gives them."""
     shares = np.concatenate([np.empty(0), *(check.shares for check in checks)])
-    if _rule(blueprint).full_speed is None:
+    if hit_rule(blueprint.stages).full_speed is None:
         return []
     count, share = repeated_share(shares, blueprint.dtype)
     same = f"{counted(count, 'hit')} with the same fraction of their highest speed, {share:.6g}"

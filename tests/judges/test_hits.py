@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.judges.rows.hits import HitRule, _gradient, hit_rule, judge_goals, repeated_share, shares_of
+from cnpgen.judges.rows.hits import HitRule, _gradients, hit_rule, judge_goals, repeated_share, shares_of
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
@@ -49,7 +49,7 @@ def test_the_gradient_is_that_of_differences_but_for_rows_of_the_jacobian() -> N
         differences = [
             (value(q + e, home, angle) - value(q - e, home, angle)) / (2 * step) for e in step * np.eye(ROBOT.n)
         ]
-        J, gradient = _gradient(ROBOT, q, home, angle)
+        (J,), (gradient,) = _gradients(ROBOT, q[None], home[None], np.array([angle]))
         np.testing.assert_array_equal(J, jacobian(q))
         outside = np.eye(ROBOT.n) - np.linalg.pinv(J) @ J
         np.testing.assert_allclose(outside @ gradient, outside @ differences, atol=1e-8)
@@ -101,7 +101,7 @@ def test_a_joint_at_its_limit_may_be_pushed_against_it() -> None:
     """A goal beyond whose limit f still rises is right; one at a limit from which f rises inwards is not."""
     random = np.random.default_rng(3)
     q = ROBOT.base + random.uniform(-0.2, 0.2, ROBOT.n)
-    J, gradient = _gradient(ROBOT, q, q, 0.3)
+    (J,), (gradient,) = _gradients(ROBOT, q[None], q[None], np.array([0.3]))
     columns = {"goal_q": q[None], "start_q": q[None], "hit_angle": np.array([[0.3]])}
     free = [0, 1, 3]  # as many as the tip has coordinates: f cannot rise there, whatever it is
     rest = gradient - J.T @ np.linalg.lstsq(J[:, free].T, gradient[free], rcond=None)[0]

@@ -46,6 +46,15 @@ def test_a_flipped_bit_in_a_shard_or_its_record_is_noticed_and_made_good(tiny, f
     assert validate_dataset(folder).ok
 
 
+@pytest.mark.filterwarnings("ignore:.*(made|written) again:RuntimeWarning")
+@pytest.mark.parametrize("name", ["manifest.json", "stats.json", "train/shard-00000.json"])
+def test_a_document_of_brackets_is_made_good(tiny, folder, name):
+    (folder / name).write_text("[" * 200_000)
+    assert make_tiny(folder).complete
+    assert digests(folder) == digests(tiny("airhockey-hit"))
+    assert validate_dataset(folder).ok
+
+
 @pytest.mark.parametrize("size", [0, 100, 5000])
 def test_a_truncated_shard_is_noticed_and_made_good(tiny, folder, size):
     path = folder / "train" / "shard-00000.h5"

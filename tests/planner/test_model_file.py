@@ -133,7 +133,7 @@ FORGERIES = {
     "a dataset that is a number": (
         lambda arrays, texts: texts.update(training='{"dataset": 1}'), "dataset must be a table, got 1"),
     "deep training": (lambda arrays, texts: texts.update(training="[" * 10**5), "tables and lists in one another"),
-    "no problem": (lambda arrays, texts: texts.update(problem_recipe="{}"), "the recipe is not that of a problem"),
+    "no problem": (lambda arrays, texts: texts.update(problem_recipe="{}"), "problem_recipe is not that of a problem"),
     "no text": (lambda arrays, texts: arrays.update(log=np.array([255], np.uint8)), "a text that is not UTF-8"),
 }  # fmt: skip
 

@@ -13,7 +13,7 @@ from cnpgen.loader.load import load_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.request_files import read_file
 from cnpgen.planner.requests import read_rows
-from cnpgen.training.data import open_training_data, stages_of
+from cnpgen.training.data import open_training_data
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
 
@@ -25,7 +25,7 @@ def model(tiny: Tiny) -> Model:
     """A model of the replans that knows how its rows were drawn."""
     folder = tiny("airhockey-replan")
     dataset = open_training_data(folder).describe()
-    training = {"dataset": dataset, "stages": stages_of(load_dataset(folder).blueprint)}
+    training = {"dataset": dataset, "stages": load_dataset(folder).blueprint.stages}
     return untrained_model("airhockey", boundary_of_columns(columns_of(folder), 20), training=training)
 
 

@@ -184,3 +184,12 @@ def test_unknown_fields_are_named_with_the_nearest_known_one() -> None:
     assert BLUEPRINT.field_named("goal_p").unit == "m"
     with pytest.raises(DatasetError, match="did you mean 'start_q'"):
         BLUEPRINT.field_named("start_p_q")
+
+
+@pytest.mark.parametrize("recipe", [{}, {"pipeline": 1}, {"pipeline": {"problem": []}}, {"pipeline": {"stage": [1]}}])
+def test_a_recipe_that_does_not_say_something_is_refused_where_it_is_asked(recipe: dict[str, Any]) -> None:
+    blueprint = replace(BLUEPRINT, recipe=recipe)
+    with pytest.raises(DatasetError, match="the blueprint of two-shards does not say its problem: pipeline"):
+        _ = blueprint.problem
+    with pytest.raises(DatasetError, match="the blueprint of two-shards does not say how rows are drawn: pipeline"):
+        _ = blueprint.stages

@@ -125,7 +125,7 @@ def test_a_plan_that_no_dataset_has_is_refused_at_once(dataset: Path, change: Ch
 
 
 def test_too_many_shards_are_refused_where_they_are_asked_for() -> None:
-    with pytest.raises(UsageError, match=r"^1,000,000,000 shards of 1 rows are too many, .* a larger shard_size$"):
+    with pytest.raises(UsageError, match=r"^1,000,000,000 shards of 1 rows are too many, .* a larger shard_size=$"):
         replace(BLUEPRINT, splits={"train": 10**9}, shard_size=1)
 
 

@@ -2,6 +2,8 @@
 
 import gzip
 import io
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -9,12 +11,16 @@ import numpy as np
 import pytest
 
 from cnpgen.cli.main import main
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.loader.load import load_dataset
+from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
+from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import seeming
 from cnpgen.store.files.sealed import read_sealed
 from cnpgen.store.shard import read_shard
+from cnpgen.validate.dataset import validate_dataset
 
 
 def archive() -> bytes:
@@ -72,3 +78,18 @@ def test_an_hdf5_file_that_is_cut_off_is_called_so(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(DatasetError, match=r"cut\.h5 is damaged or cut off: "):
         read_shard(path)
+
+
+@pytest.mark.parametrize("read", [load_plans, load_model, load_boundary_problems])
+def test_a_pipe_is_not_waited_for(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    os.mkfifo(tmp_path / "given.h5")
+    with pytest.raises(UsageError, match=r"given\.h5 is (a device or a pipe|not there), expected"):
+        read(tmp_path / "given.h5")
+
+
+def test_a_folder_with_a_pipe_in_it_is_looked_at(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "plan.json")
+    with pytest.raises(DatasetError, match="is not a dataset of cnpgen"):
+        validate_dataset(tmp_path)
+    with pytest.raises(DatasetError, match=r"plan\.json is not a file"):
+        load_dataset(tmp_path)

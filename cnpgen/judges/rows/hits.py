@@ -63,7 +63,7 @@ def judge_goals(
     if rule.near and "hit_angle" in columns:
         q, angle = columns["goal_q"][finite], columns["hit_angle"][finite, 0]
         home = columns["start_q"][finite] if rule.near == "start" else np.broadcast_to(robot.base, q.shape)
-        error = np.array([_slope(robot, *row, AT_LIMIT[dtype]) for row in zip(q, home, angle, strict=True)])
+        error = _slopes(robot, q, home, angle, AT_LIMIT[dtype])
         judged.append(_compared("hitting configuration", "m^2/rad", error, STATIONARY[dtype], finite))
     if rule.full_speed is not None and "hit_speed_max" in columns:
         share = shares_of(columns)[finite]
@@ -107,29 +107,41 @@ def _compared(name: str, unit: str, error: Array, allowed: float, rows: Index) -
     return compare(name, unit, violation=error, allowed=np.full(len(rows), allowed), row=rows, end=ones)
 
 
-def _slope(robot: "Robot", q: Array, home: Array, angle: float, at_limit: float) -> float:
-    """Compute how steeply f still rises in a direction that is left to the joints [m^2/rad]."""
-    jacobian, gradient = _gradient(robot, q, home, angle)
+def _slopes(robot: "Robot", q: Array, home: Array, angle: Array, at_limit: float) -> Array:
+    """Compute how steeply f still rises in a direction that is left to the joints [m^2/rad], shape (rows,)."""
+    jacobian, gradient = _gradients(robot, q, home, angle)
     low, high = q - robot.position_lower < at_limit, robot.position_upper - q < at_limit
-    free = ~(low | high)
-    multiplier, *_ = np.linalg.lstsq(jacobian[:, free].T, gradient[free], rcond=None)
-    rest = gradient - jacobian.T @ multiplier
-    against = np.where(high, -rest, np.where(low, rest, np.abs(rest)))  # at a limit f may rise beyond it
-    return float(np.max(against, initial=0.0))
+    free = jacobian * ~(low | high)[:, None]
+    multiplier = np.linalg.pinv(free @ free.swapaxes(1, 2)) @ (free @ gradient[:, :, None])
+    rest = gradient - (jacobian.swapaxes(1, 2) @ multiplier)[:, :, 0]
+    rising = np.where(high, -rest, np.where(low, rest, np.abs(rest)))  # at a limit f may rise beyond it
+    return np.asarray(rising.max(axis=1, initial=0.0))
 
 
-def _gradient(robot: "Robot", q: Array, home: Array, angle: float) -> tuple[Array, Array]:
-    """Return J, shape (3, n), and the gradient of f, shape (n,), by Pinocchio's derivatives of the tip's velocity.
+def _gradients(robot: "Robot", q: Array, home: Array, angle: Array) -> tuple[Array, Array]:
+    """Return J and the gradient of f, by Pinocchio's derivatives of the tip's velocity.
 
     Pinocchio differentiates the velocity of the tip's frame as if its axes turned with it. That adds a combination of
     the rows of J to the gradient, which changes nothing of what is left when such are taken out.
+
+    Args:
+        robot: The robot.
+        q: Joint positions [rad], shape (rows, n).
+        home: The configurations to stay close to [rad], shape (rows, n).
+        angle: Directions of the hits [rad], shape (rows,).
+
+    Returns:
+        Shapes (rows, 3, n) and (rows, n).
     """
     import pinocchio as pin
 
-    model, frame = robot.model, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    model, tip, frame = robot.model, robot.tip_frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     data, still = model.createData(), np.zeros(robot.n)
-    direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-    jacobian = np.array(pin.computeFrameJacobian(model, data, q, robot.tip_frame, frame)[:3])
-    pin.computeForwardKinematicsDerivatives(model, data, q, jacobian.T @ direction, still)
-    by_position, _ = pin.getFrameVelocityDerivatives(model, data, robot.tip_frame, frame)
-    return jacobian, 2 * direction @ by_position[:3] + 2 * (home - q) / robot.rated_velocity**2
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
+    jacobian, slope = np.empty((len(q), 3, robot.n)), np.empty((len(q), robot.n))
+    for row in range(len(q)):
+        jacobian[row] = pin.computeFrameJacobian(model, data, q[row], tip, frame)[:3]
+        pin.computeForwardKinematicsDerivatives(model, data, q[row], direction[row] @ jacobian[row], still)
+        by_position, _ = pin.getFrameVelocityDerivatives(model, data, tip, frame)
+        slope[row] = direction[row] @ by_position[:3]
+    return jacobian, 2 * slope + 2 * (home - q) / robot.rated_velocity**2
