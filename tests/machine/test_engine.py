@@ -2,12 +2,14 @@
 
 import logging
 import os
+import pickle
 import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,13 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine import clusters
 from cnpgen.machine.clusters import Cluster
 from cnpgen.machine.engine import Engine, assembled
+from cnpgen.make.blueprint import draw_up
+from cnpgen.make.dataset import _for_others
+from cnpgen.make.shards import _PREPARED, make_shards
+from cnpgen.store.blueprint import shards, write_blueprint
+from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.dataset import validate_dataset
-from tests.conftest import HANGING
+from tests.conftest import HANGING, TINY_SHARD, tiny_recipe
 from tests.examples.tiny_datasets import digests, make_tiny
 from tests.machine.test_workers import die_once
 
@@ -136,6 +143,23 @@ def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplo
         "nobody is working: the cluster of the test has had no worker for 20 s; waiting for one",
         "nobody is working: the cluster of the test has had no worker for 40 s; waiting for one",
     ]
+
+
+def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_other_rows(tmp_path, monkeypatch):
+    recipe = tiny_recipe("airhockey-hit")
+    folder = tmp_path / "out"
+    job = draw_up(recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy")
+    theirs = pickle.loads(pickle.dumps(_for_others(job)))
+    assert theirs.pipeline is theirs.cache_folder is None
+    monkeypatch.chdir(tmp_path)
+    write_blueprint(folder, job.blueprint)
+    (result,) = list(make_shards(theirs, shards(job.blueprint)[-1:]))
+    assert result[0] == 60
+    _PREPARED.clear()
+    for change in ({"revision": 1}, {"recipe_sha256": "0" * 64}):
+        other = replace(theirs, blueprint=replace(job.blueprint, **change))
+        with pytest.raises(MachineError, match="has another version of cnpgen, or of a plug-in"):
+            list(make_shards(other, shards(job.blueprint)[-1:]))
 
 
 # --- real ones --------------------------------------------------------------------------------------------------------
