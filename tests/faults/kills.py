@@ -33,10 +33,12 @@ class Kills:
     """What came of many kills.
 
     Attributes:
+        struck: How many processes were sent a signal.
         runs: How many runs were killed, by kind and by how the last killed process ended.
         findings: What was not as it must be, a line each.
     """
 
+    struck: int = 0
     runs: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
 
@@ -109,7 +111,7 @@ def kill(count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = 
     """Kill runs of commands at random moments, let them go on, and compare what they make with that of an uncut run.
 
     Args:
-        count: How many runs.
+        count: How many processes are struck; the last run may be struck more often.
         seed: Seed of all choices.
         first: Number of the first run.
         kinds: Commands that are run.
@@ -118,16 +120,21 @@ def kill(count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = 
     with tempfile.TemporaryDirectory(prefix="cnpgen-kills-") as place:
         _share(Path(place) / "shared")
         uncut = {name: _uncut(KINDS[name], Path(place), name) for name in kinds}
-        for number in range(first, first + count):
+        number = first
+        while outcome.struck < count:
             chosen = random.Random(f"{seed} {number}")
             name = chosen.choice(kinds)
             folder = Path(place) / f"run{number}"
             folder.mkdir()
             try:
-                outcome.runs[f"{name}, {_killed(KINDS[name], folder, chosen, uncut[name])}"] += 1
+                struck, how = _killed(KINDS[name], folder, chosen, uncut[name])
+                outcome.runs[f"{name}, {how}"] += 1
+                outcome.struck += struck
             except (AssertionError, subprocess.TimeoutExpired) as error:
-                outcome.findings.append(f"seed {seed}, kill {number}, {name}: {type(error).__name__} {error}")
+                outcome.findings.append(f"seed {seed}, run {number}, {name}: {type(error).__name__} {error}")
+                outcome.struck += 1
             shutil.rmtree(folder)
+            number += 1
     return outcome
 
 
@@ -149,25 +156,23 @@ def _uncut(kind: Kind, place: Path, name: str) -> tuple[object, float]:
     return kind.product(folder), time.monotonic() - begun
 
 
-def _killed(kind: Kind, folder: Path, chosen: random.Random, uncut: tuple[object, float]) -> str:
-    """Kill a run, perhaps several times, and let it end; say how the killed process ended."""
+def _killed(kind: Kind, folder: Path, chosen: random.Random, uncut: tuple[object, float]) -> tuple[int, str]:
+    """Kill a run, perhaps several times, and let it end; say how often, and how the last killed process ended."""
     kind.prepare(folder.parent / "shared", folder)
     expected, seconds = uncut
-    ended = "not killed"
-    for _ in range(chosen.randint(1, ROUNDS)):
+    for struck in range(1, chosen.randint(1, ROUNDS) + 1):  # noqa: B007 - counts
         words = kind.words(folder, chosen.choice((1, 2)))
         with subprocess.Popen(_command(words), start_new_session=True, stderr=subprocess.DEVNULL, stdout=-3) as process:
             time.sleep(chosen.uniform(0.2, 1.2 * seconds))
             _strike(process, chosen)
             code = process.wait(HANGS)
         assert code in {0, 1, 3, 130, 143, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT}, f"it ended with {code}"
-        ended = f"ended with {code}"
         if (folder / "plans.h5").exists():  # it was faster, and would now refuse to replace them
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)
     assert kind.product(folder) == expected, "another result"
-    return ended
+    return struck, f"ended with {code}"
 
 
 def _strike(process: subprocess.Popen[bytes], chosen: random.Random) -> None:
