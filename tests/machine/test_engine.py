@@ -50,9 +50,25 @@ def test_what_cannot_be_meant_is_refused_before_anything_is_made(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_shell_says_its_options(tmp_path, capsys):
-    assert main(["make-dataset", "airhockey-hit", "--n", "10", "--address", "a:1", "-o", str(tmp_path / "out")]) == 2
+COMMANDS = {
+    "make-dataset": ["airhockey-hit", "--n", "10", "-o", "{out}"],
+    "extend": ["{tiny}", "--n", "700"],
+    "validate": ["{tiny}", "--deep"],
+    "solve": ["{tiny}", "--n", "2", "-o", "{out}"],
+    "refine": ["{plans}", "-o", "{out}"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_shares_work_takes_the_options_and_says_them_in_errors(tiny, tmp_path, capsys, command):
+    cnpgen.save_plans(tmp_path / "plans.h5", cnpgen.load_boundary_problems(tiny("airhockey-hit"), n=2))
+    places = {"out": tmp_path / "out", "tiny": tiny("airhockey-hit"), "plans": tmp_path / "plans.h5"}
+    words = [command, *(word.format(**places) for word in COMMANDS[command])]
+    assert main([*words, "--address", "a:1"]) == 2
     assert capsys.readouterr().err.endswith("is that of a cluster: say of which with --engine (dask, ray)\n")
+    assert not (tmp_path / "out").exists()
+    assert main([*words, "--engine", "dusk"]) == 2
+    assert "--engine: expected one of loky, dask, ray, got 'dusk' (did you mean 'dask'?)" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
