@@ -13,7 +13,7 @@ import uuid
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -82,7 +82,7 @@ def share_out(
 
 def _generated(
     function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool, **options: Any
-) -> Iterator[R]:
+) -> Generator[R, None, None]:
     """Let joblib yield the results, on the backend that ``parallel_config`` names."""
     from joblib import Parallel, delayed
 
@@ -120,8 +120,9 @@ def _on_processes(function: Callable[[T], R], tasks: Iterable[T], workers: int, 
     _start_helpers()
     ours: dict[str, Any] = {"initializer": _end_with, "initargs": (os.getpid(),)}
     with _shared_folder() as folder:
-        packed = _generated(partial(_packed, function, folder), tasks, workers, ordered=ordered, **ours)
-        yield from map(_unpacked, packed)
+        pack = partial(_packed, function, folder)
+        with closing(_generated(pack, tasks, workers, ordered=ordered, **ours)) as packed:
+            yield from map(_unpacked, packed)
 
 
 def _packed(function: Callable[[T], R], folder: str, task: T) -> bytes | str:

@@ -1,5 +1,6 @@
 """Making shards: their blocks, the spot check by Pinocchio and Coal, the commit."""
 
+import platform
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,10 +16,11 @@ from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
 from cnpgen.make.load import restored
+from cnpgen.make.recipe import recipe_digest
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.blueprint import Blueprint, ShardTask
+from cnpgen.store.blueprint import REVISION, Blueprint, ShardTask
 from cnpgen.store.fates import Fates, merge_fates
 from cnpgen.store.field import Field
 from cnpgen.store.record import commit_shard
@@ -51,13 +53,18 @@ def prepare(job: Job) -> PreparedPipeline:
     """Load the stages of what is made.
 
     Raises:
-        MachineError: The backend does not work on this machine.
+        MachineError: The backend does not work on this machine, or this version of cnpgen would make other rows.
     """
     cache_folder = choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
     load = partial(PreparedPipeline, backend=job.backend, cache_folder=cache_folder, dtype=job.blueprint.dtype)
     if job.pipeline is not None:
         return load(job.pipeline)
     with restored(job.blueprint) as recipe:
+        if job.blueprint.revision != REVISION or recipe_digest(recipe) != job.blueprint.recipe_sha256:
+            raise MachineError(
+                f"{platform.node()} has another version of cnpgen, or of a plug-in, which would make other rows:"
+                " install the same ones on all machines"
+            )
         return load(recipe.pipeline)
 
 

@@ -1,9 +1,10 @@
-"""Faults in large numbers: ``python -m tests.faults --inputs 100000 --seed 1``; the exit code is 1 if any is found."""
+"""Faults in large numbers: ``python -m tests.faults --kills 200 --inputs 100000``; the exit code is 1 if any is found."""
 
 import argparse
 import sys
 
 from tests.faults.fuzz import fuzz
+from tests.faults.kills import kill
 from tests.faults.subjects import SUBJECTS
 
 
@@ -11,10 +12,30 @@ def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--inputs", metavar="N", type=int, default=0, help="changed files to read")
+    parser.add_argument(
+        "--kills", metavar="N", type=int, default=0, help="processes to kill; what they did is started again"
+    )
     parser.add_argument("--seed", metavar="S", type=int, default=0, help="seed of everything")
-    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input")
+    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input, or kill")
     parser.add_argument("--kind", choices=tuple(SUBJECTS), action="append", help="only files of this kind")
     arguments = parser.parse_args()
+    findings = [*_killed(arguments)] if arguments.kills else []
+    findings += _changed(arguments) if arguments.inputs else []
+    print(f"{len(findings)} findings", *findings, sep="\n")
+    return 1 if findings else 0
+
+
+def _killed(arguments: argparse.Namespace) -> list[str]:
+    """Kill processes, print what they were, and return what went wrong."""
+    killed = kill(arguments.kills, seed=arguments.seed, first=arguments.first)
+    for what, count in sorted(killed.runs.items()):
+        print(f"{count:>6,} {what}")
+    print(f"{killed.struck:>6,} processes struck")
+    return [str(each) for each in killed.findings]
+
+
+def _changed(arguments: argparse.Namespace) -> list[str]:
+    """Read changed files, print how many were refused, and return what went wrong."""
     outcome = fuzz(
         arguments.inputs,
         seed=arguments.seed,
@@ -24,8 +45,7 @@ def main() -> int:
     )
     for kind in SUBJECTS:
         print(f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused")
-    print(f"{len(outcome.findings)} findings", *outcome.findings, sep="\n")
-    return 1 if outcome.findings else 0
+    return [str(each) for each in outcome.findings]
 
 
 if __name__ == "__main__":

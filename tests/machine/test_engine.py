@@ -2,12 +2,14 @@
 
 import logging
 import os
+import pickle
 import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,13 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine import clusters
 from cnpgen.machine.clusters import Cluster
 from cnpgen.machine.engine import Engine, assembled
+from cnpgen.make.blueprint import draw_up
+from cnpgen.make.dataset import _for_others
+from cnpgen.make.shards import _PREPARED, make_shards
+from cnpgen.store.blueprint import shards, write_blueprint
+from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.dataset import validate_dataset
-from tests.conftest import HANGING
+from tests.conftest import HANGING, TINY_SHARD, tiny_recipe
 from tests.examples.tiny_datasets import digests, make_tiny
 from tests.machine.test_workers import die_once
 
@@ -43,9 +50,25 @@ def test_what_cannot_be_meant_is_refused_before_anything_is_made(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_shell_says_its_options(tmp_path, capsys):
-    assert main(["make-dataset", "airhockey-hit", "--n", "10", "--address", "a:1", "-o", str(tmp_path / "out")]) == 2
+COMMANDS = {
+    "make-dataset": ["airhockey-hit", "--n", "10", "-o", "{out}"],
+    "extend": ["{tiny}", "--n", "700"],
+    "validate": ["{tiny}", "--deep"],
+    "solve": ["{tiny}", "--n", "2", "-o", "{out}"],
+    "refine": ["{plans}", "-o", "{out}"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_shares_work_takes_the_options_and_says_them_in_errors(tiny, tmp_path, capsys, command):
+    cnpgen.save_plans(tmp_path / "plans.h5", cnpgen.load_boundary_problems(tiny("airhockey-hit"), n=2))
+    places = {"out": tmp_path / "out", "tiny": tiny("airhockey-hit"), "plans": tmp_path / "plans.h5"}
+    words = [command, *(word.format(**places) for word in COMMANDS[command])]
+    assert main([*words, "--address", "a:1"]) == 2
     assert capsys.readouterr().err.endswith("is that of a cluster: say of which with --engine (dask, ray)\n")
+    assert not (tmp_path / "out").exists()
+    assert main([*words, "--engine", "dusk"]) == 2
+    assert "--engine: expected one of loky, dask, ray, got 'dusk' (did you mean 'dask'?)" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
@@ -136,6 +159,23 @@ def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplo
         "nobody is working: the cluster of the test has had no worker for 20 s; waiting for one",
         "nobody is working: the cluster of the test has had no worker for 40 s; waiting for one",
     ]
+
+
+def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_other_rows(tmp_path, monkeypatch):
+    recipe = tiny_recipe("airhockey-hit")
+    folder = tmp_path / "out"
+    job = draw_up(recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy")
+    theirs = pickle.loads(pickle.dumps(_for_others(job)))
+    assert theirs.pipeline is theirs.cache_folder is None
+    monkeypatch.chdir(tmp_path)
+    write_blueprint(folder, job.blueprint)
+    (result,) = list(make_shards(theirs, shards(job.blueprint)[-1:]))
+    assert result[0] == 60
+    _PREPARED.clear()
+    for change in ({"revision": 1}, {"recipe_sha256": "0" * 64}):
+        other = replace(theirs, blueprint=replace(job.blueprint, **change))
+        with pytest.raises(MachineError, match="has another version of cnpgen, or of a plug-in"):
+            list(make_shards(other, shards(job.blueprint)[-1:]))
 
 
 # --- real ones --------------------------------------------------------------------------------------------------------

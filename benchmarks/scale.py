@@ -1,0 +1,149 @@
+"""What large datasets cost: docs/scale.md's table of core-hours, disk, files and memory, from rates measured here.
+
+A small dataset of each kind is made and checked in this process, in shards as large as the large one's; the clock is
+the process's CPU time. The rest is multiplication.
+
+    python benchmarks/scale.py
+    python benchmarks/scale.py --rows 1e8 --certified 1e7 --sample 262144 --certified-sample 256
+"""
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from common import arguments, progress, report, table
+
+import cnpgen
+from cnpgen.make.dataset import finish
+from cnpgen.store.blueprint import default_shard_size, load_blueprint
+from cnpgen.store.layout import DOCUMENTS
+
+CERTIFIED_BLOCK = 64  # rows
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What a dataset takes.
+
+    Attributes:
+        name: What it is made of.
+        rows: Its rows.
+        make: CPU time per row [s].
+        check: CPU time per row to compare it with its records [s].
+        deep: CPU time per row of ``validate --deep`` [s].
+        finish: CPU time per shard to sum up [s].
+        row_bytes: Bytes per row, records of shards included.
+        shard_rows: Rows per shard.
+        memory: The most that the process has held [MB].
+    """
+
+    name: str
+    rows: int
+    make: float
+    check: float
+    deep: float
+    finish: float
+    row_bytes: float
+    shard_rows: int
+    memory: float
+
+    @property
+    def shards(self) -> int:
+        """Shards, of one split; every further one may add one."""
+        return -(-self.rows // self.shard_rows)
+
+    @property
+    def files(self) -> int:
+        """Files: two per shard, and the documents."""
+        return 2 * self.shards + len(DOCUMENTS)
+
+
+def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
+    """Make a small dataset, and say what a large one takes."""
+    block = CERTIFIED_BLOCK if options.get("certify") else 4096
+    shard_rows = default_shard_size(rows, block)
+    with tempfile.TemporaryDirectory(prefix="cnpgen-scale-") as place:
+        folder = Path(place) / "out"
+        settings = {"workers": 1, "shard_size": min(shard_rows, sample), **options}
+        cnpgen.make_dataset(name, Path(place) / "first", n=block, **{**settings, "shard_size": block})  # compiles
+        make = seconds(lambda: cnpgen.make_dataset(name, folder, n=sample, **settings))
+        check = seconds(lambda: cnpgen.make_dataset(name, folder, n=sample, **settings))
+        deep = seconds(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))
+        blueprint = load_blueprint(folder)
+        shards = sorted(path for path in folder.glob("*/*.h5"))
+        summed = seconds(lambda: finish(folder, blueprint, "", made=1, alone=True))
+        size = sum(path.stat().st_size for path in folder.glob("*/*"))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    title = f"{name}, certified" if options.get("certify") else f"{name}, {options.get('dtype', 'float64')}"
+    per_row = (make / sample, check / sample, deep / sample)
+    return Costs(title, rows, *per_row, summed / len(shards), size / sample, shard_rows, memory)
+
+
+def seconds(run: Callable[[], object]) -> float:
+    """Return the CPU time that something takes [s]."""
+    begun = time.process_time()
+    run()
+    return time.process_time() - begun
+
+
+def rows_of(costs: list[Costs]) -> list[list[str]]:
+    return [
+        [
+            each.name,
+            f"{each.rows:.0e}",
+            f"{1 / each.make:,.0f}",
+            f"{each.rows * each.make / 3600:,.2f}",
+            f"{each.rows * each.deep / 3600:,.2f}",
+            f"{each.rows * each.check / 60:,.1f}",
+            f"{each.shards * each.finish / 60:,.2f}",
+            f"{each.rows * each.row_bytes / 1e9:,.1f}",
+            f"{each.shard_rows:,}",
+            f"{each.files:,}",
+            f"{each.memory:,.0f}",
+        ]
+        for each in costs
+    ]
+
+
+HEAD = (
+    "dataset",
+    "rows",
+    "rows per core-second",
+    "core-hours to make",
+    "for --deep",
+    "core-minutes to compare",
+    "to sum up",
+    "disk [GB]",
+    "rows per shard",
+    "files",
+    "memory per worker [MB]",
+)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--rows", type=float, default=1e8, help="rows of the datasets without plans")
+    parser.add_argument("--certified", type=float, default=1e7, help="rows of the certified one")
+    parser.add_argument("--sample", type=int, default=131072, help="rows that are made")
+    parser.add_argument("--certified-sample", type=int, default=128, help="likewise, with plans")
+
+
+def main() -> None:
+    options = arguments(__doc__, add_options)
+    costs = []
+    for name in ("airhockey-hit", "heavy-object"):
+        progress(f"{name}: {options.sample} rows")
+        costs.append(measure(name, int(options.rows), options.sample, dtype="float32"))
+    progress(f"airhockey-hit: {options.certified_sample} rows with plans")
+    costs.append(measure("airhockey-hit", int(options.certified), options.certified_sample, certify=True))
+    report(
+        {"datasets": [asdict(each) for each in costs]}, [table("datasets", HEAD, rows_of(costs))], as_json=options.json
+    )
+
+
+if __name__ == "__main__":
+    main()
