@@ -180,7 +180,7 @@ def python(code: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "command", ["", "make-dataset", "validate", "inspect", "list", "show", "evaluate", "export", "doctor"]
+    "command", ["", "make-dataset", "validate", "inspect", "list", "show", "complete", "evaluate", "export", "doctor"]
 )
 def test_help_is_given_without_loading_anything_heavy(command: str) -> None:
     code = f"""
