@@ -1,3 +1,15 @@
+from cnpgen.benchmark.planner import BenchmarkPlanner as BenchmarkPlanner
+from cnpgen.benchmark.planner import Setting as Setting
+from cnpgen.benchmark.pucks import Pucks as Pucks
+from cnpgen.benchmark.report import save_benchmark_report as save_benchmark_report
+from cnpgen.benchmark.run import Benchmark as Benchmark
+from cnpgen.benchmark.run import run_benchmark as run_benchmark
+from cnpgen.benchmark.suite import Draws as Draws
+from cnpgen.benchmark.suite import Suite as Suite
+from cnpgen.benchmark.suite import load_suite as load_suite
+from cnpgen.benchmark.trajectory import Trajectory as Trajectory
+from cnpgen.benchmark.turns import Lead as Lead
+from cnpgen.benchmark.turns import Turns as Turns
 from cnpgen.errors import CnpgenError as CnpgenError
 from cnpgen.errors import DatasetError as DatasetError
 from cnpgen.errors import MachineError as MachineError
@@ -33,7 +45,9 @@ from cnpgen.make.complete import complete as complete
 from cnpgen.make.complete import complete_table as complete_table
 from cnpgen.make.dataset import MadeDataset as MadeDataset
 from cnpgen.make.dataset import make_dataset as make_dataset
+from cnpgen.make.extend import extend_dataset as extend_dataset
 from cnpgen.make.load import load_dataset_recipe as load_dataset_recipe
+from cnpgen.make.merge import merge_datasets as merge_datasets
 from cnpgen.make.recipe import DatasetRecipe as DatasetRecipe
 from cnpgen.pipelines.load import load_pipeline as load_pipeline
 from cnpgen.pipelines.pipeline import Pipeline as Pipeline
@@ -82,6 +96,10 @@ from cnpgen.robots.spec import LimitSpec as LimitSpec
 from cnpgen.robots.spec import Obstacle as Obstacle
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
+from cnpgen.simulator.executed import Executed as Executed
+from cnpgen.simulator.plant import Plant as Plant
+from cnpgen.simulator.simulate import Simulation as Simulation
+from cnpgen.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.store.blueprint import Blueprint as Blueprint
 from cnpgen.store.blueprint import ShardTask as ShardTask
 from cnpgen.store.blueprint import StoredProblem as StoredProblem
@@ -98,6 +116,7 @@ from cnpgen.training.train import Trained as Trained
 from cnpgen.training.train import train_model as train_model
 from cnpgen.trajectory.boundary import Boundary as Boundary
 from cnpgen.trajectory.fit import fit_motion as fit_motion
+from cnpgen.trajectory.joined import JoinedMotion as JoinedMotion
 from cnpgen.trajectory.motion import Motion as Motion
 from cnpgen.trajectory.motion import States as States
 from cnpgen.trajectory.spec import TrajectorySpec as TrajectorySpec

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Options, Parser, add_json
+from cnpgen.cli.parser import Options, Parser, add_engine, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
@@ -37,6 +37,7 @@ def add_options(parser: Parser) -> None:
     """Add the options of both commands."""
     add_refining(parser)
     parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
+    add_engine(parser)
     parser.add_argument(
         "--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part"
     )
@@ -110,6 +111,8 @@ def refine_and_save(
             plans,
             options=options,
             workers=arguments.workers,
+            engine=arguments.engine,
+            address=arguments.address,
             journal=journal,
             discard=arguments.force,
             begin=lambda total, there: meter.begin(title, total, there),

@@ -67,13 +67,16 @@ def draw_up(
     """
     total, root, shard_size = _check(recipe, n, seed, shard_size)
     digest, begun = recipe_digest(recipe), workspace.blueprint
-    if begun is not None and begun.recipe_sha256 == digest and not force:
+    if begun is not None and (begun.recipe_sha256 != digest or force):
+        begun = None  # another dataset, or one that goes
+    if begun is not None:
         backend = begun.backend if backend is None else backend
         shard_size = begun.shard_size if shard_size is None else shard_size
     chosen, cache_folder = choose_backend(backend)
     prepared = PreparedPipeline(recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
     if prepared.tasks is not None:
         total = _answered(prepared, recipe, root, n)
+    splits = split_rows(recipe, total)
     blueprint = Blueprint(
         name=recipe.name,
         version=recipe.version,
@@ -82,7 +85,7 @@ def draw_up(
         recipe_sha256=digest,
         recipe=resolved(recipe),
         seed=root,
-        splits=split_rows(recipe, total),
+        splits=splits,
         shard_size=shard_size or default_shard_size(total, prepared.block_rows),
         block_rows=prepared.block_rows,
         dtype=dtype,
@@ -90,6 +93,7 @@ def draw_up(
         fields=prepared.fields,
         robot=_robot_record(prepared),
         versions=versions(),
+        earlier=begun.earlier if begun is not None and begun.splits == splits else (),
     )
     return Job(workspace.folder, blueprint, recipe.pipeline, chosen, cache_folder)
 

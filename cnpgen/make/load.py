@@ -1,5 +1,8 @@
 """Dataset recipes from files, by name or path, and from the blueprints of datasets."""
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +21,7 @@ from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import is_kind, read_table
+from cnpgen.store.blueprint import Blueprint
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
@@ -83,6 +87,18 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     if made is None or mistakes:
         raise RecipeError(mistakes)
     return replace(made, path=path)
+
+
+@contextmanager
+def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
+    """Rebuild the recipe from a blueprint, its URDF in a temporary folder that is gone when the block ends.
+
+    Raises:
+        RecipeError: It does not fit this version of cnpgen.
+        PluginError: It needs packages that are not installed.
+    """
+    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+        yield restore_dataset_recipe(dict(blueprint.recipe), str(blueprint.robot["urdf"]), Path(folder))
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:

@@ -3,7 +3,6 @@
 import csv
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, MachineError, UsageError, nearest
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
-from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import HDF5
 from cnpgen.store.paths import require_file
 
@@ -73,8 +72,8 @@ def _is_hdf5(path: Path) -> bool:
 
 
 def _hdf5_columns(path: Path) -> dict[str, Array]:
-    with opened_foreign_hdf5(path) as file:
-        found: dict[str, Any] = {name: item[()] for name, item in file.items() if hasattr(item, "dtype")}
+    with opened_hdf5(path) as file:
+        found = {name: column.read() for name, column in file.columns().items()}
     try:
         columns: dict[str, Array] = {name: numbers(name, values) for name, values in found.items()}
     except UsageError as error:

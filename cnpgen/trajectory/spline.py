@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+HUGE = 1e150  # control points beyond it are scaled before their products, which would be infinite, are taken
+
 
 def clamped_knots(points: int, degree: int) -> Array:
     """Return the knot vector of the paper's Appendix A, shape (points + degree + 1,)."""
@@ -28,16 +30,31 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     Returns:
         Shape (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of the spline.
     """
-    knots, worth = clamped_knots(points, degree), np.eye(points)
-    for p in range(degree, degree - order, -1):  # control points of the derivative, in place of the function's
-        worth = np.diff(worth, axis=0) * p / (knots[p + 1 : -1] - knots[1 : -p - 1])[:, None]
-        knots = knots[1:-1]
+    knots, worth = derivative(points, degree, order)
     degree -= order
     first = np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(worth) - 1) - degree
     values = np.zeros((len(s), points))
     for k, weight in enumerate(_cox_de_boor(s, knots, degree, first)):
         values += weight[:, None] * worth[first + k]
     return values
+
+
+def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
+    """Return the knots of a derivative of a spline, and the matrix that turns its control points into the derivative's.
+
+    Args:
+        points: Number of control points C.
+        degree: Degree D.
+        order: Order of the derivative with respect to s, at most D.
+
+    Returns:
+        ``(knots, matrix)``: shapes (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is D - order.
+    """
+    knots, matrix = clamped_knots(points, degree), np.eye(points)
+    for p in range(degree, degree - order, -1):
+        matrix = np.diff(matrix, axis=0) * p / (knots[p + 1 : -1] - knots[1 : -p - 1])[:, None]
+        knots = knots[1:-1]
+    return knots, matrix
 
 
 def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -> Array:
@@ -123,10 +140,11 @@ def extremes(control: Array, degree: int) -> tuple[Array, Array]:
     """Return where on [0, 1] one spline of finite control points, shape (C,), ends or turns, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
-    spline = BSpline(clamped_knots(len(control), degree), control, degree)
+    scale = 2.0**-600 if np.abs(control).max() > HUGE else 1.0  # a power of two, which changes no digit
+    spline = BSpline(clamped_knots(len(control), degree), control * scale, degree)
     turning = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
     s = np.clip(np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]]), 0, 1)
-    return s, np.asarray(spline(s))
+    return s, np.asarray(spline(s)) / scale
 
 
 @dataclass(frozen=True)
