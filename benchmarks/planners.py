@@ -20,7 +20,7 @@ from refiner_problems import PUCKS, make_each
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import shipped_models
-from cnpgen.planner.planner import Planner
+from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans import Plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.refine.options import DEFAULT
@@ -100,7 +100,7 @@ def measure_grid(name: str) -> dict[str, float]:
 
 
 def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, Any]]:
-    """Plan anew from points on valid plans, to the same goal and to another one."""
+    """Plan anew from points on valid plans, to the same goal and to another one, by the network alone."""
     planner = Planner(name)
     plans = planner.plan_batch(draw_boundary_problems(name, planned, seed=seed).boundary)
     plans, found = plans[evaluate_plans(plans).valid], []
@@ -108,7 +108,8 @@ def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, A
     for goal, ends in (("same", plans.boundary), ("another", plans.boundary[others])):
         for when in WHEN:
             progress(f"{name}: {len(plans)} plans replanned at {when:g} T to {goal} goal")
-            new = planner.replan(plans, when * plans.duration, goal_q=ends.goal_q, goal_dq=ends.goal_dq)
+            q, dq, ddq = states_at(plans, when * plans.duration)
+            new = planner.plan(q, ends.goal_q, start_dq=dq, start_ddq=ddq, goal_dq=ends.goal_dq)
             facts = {"goal": goal, "at": when, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
             facts["refined valid"] = float(refine_plans(new[:refined]).valid.mean())
             facts["T / left"] = float(new.duration.mean() / ((1 - when) * plans.duration.mean()))

@@ -190,6 +190,7 @@ def python(code: str) -> str:
         "inspect",
         "list",
         "show",
+        "complete",
         "evaluate",
         "simulate",
         "benchmark",

@@ -50,6 +50,11 @@ class CertifiedPlan(Stage):
             Field("duration", "s", "its motion time", role="target"),
         )
 
+    def takes(self, context: Context) -> tuple[Field, ...]:
+        """Nothing: tasks bring no plans."""
+        del context
+        return ()
+
     def prepare(self, context: Context) -> Work:
         """Load the refiner."""
         if context.dtype != "float64":

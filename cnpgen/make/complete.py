@@ -70,7 +70,8 @@ def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayL
     """
     pipeline = _pipeline(recipe)
     completion = Completion(pipeline, load_context(pipeline.problem, *choose_backend(None)), columns)
-    given = {name: _rows(completion.given[name], values) for name, values in columns.items()}
+    flat = completion.height is not None
+    given = {name: _rows(completion.given[name], values, flat=flat) for name, values in columns.items()}
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
@@ -105,10 +106,10 @@ def _pipeline(recipe: str | Path | Pipeline | DatasetRecipe) -> Pipeline:
     return recipe if isinstance(recipe, Pipeline) else as_dataset_recipe(recipe).pipeline
 
 
-def _rows(field: Field, values: ArrayLike) -> Array:
-    """Return the values of a field as rows, shape (N, w); a position may have no z."""
+def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:
+    """Return the values of a field as rows, shape (N, w); on a table (``flat``) a position may have no z."""
     array, width = numbers(field.name, values), max(field.width, 1)
-    widths = {width, 2} if field.name.endswith("_xyz") else {width}
+    widths = {width, 2} if flat and field.name.endswith("_xyz") else {width}
     if not field.width:
         array = array[..., None]
     if array.ndim not in {1, 2} or array.shape[-1] not in widths:

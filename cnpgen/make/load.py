@@ -11,8 +11,7 @@ from typing import Any
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import read_pipeline
-from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.prepared import listed_tasks
+from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults

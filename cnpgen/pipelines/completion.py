@@ -8,7 +8,7 @@ from cnpgen.errors import RecipeError, UsageError, lacks
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.stage import Array, Stage, Tasks, Work
+from cnpgen.pipelines.stages.stage import Array, Stage, TaskRound, Work
 from cnpgen.pipelines.steps import Step, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
@@ -31,6 +31,7 @@ class Completion:
     Attributes:
         context: Problem, robot and kernels.
         given: What tasks give: name -> field.
+        height: Of positions on the problem's table [m], whose z may be left out; None where there is no table.
 
     Raises:
         UsageError: The pipeline does not take such a column, or needs others.
@@ -43,7 +44,7 @@ class Completion:
         _check(pipeline, fields, given)
         self.context, self.given = context, {name: fields[name] for name in given}
         self._fields = stored_fields(steps, context)[:-2]  # without those about draws
-        self._height = _table_height(context)
+        self.height = _table_height(context)
         self._derived = _derived(given)
         known = {*given, *self._derived}
         written = written_columns(pipeline.path, steps, context)
@@ -53,7 +54,7 @@ class Completion:
             self._accept = acceptance(context, written, given=_given_ends(given))
         self._random = np.random.default_rng(0)  # of plug-ins that draw past their round
 
-    def __call__(self, columns: Mapping[str, Array]) -> Tasks:
+    def __call__(self, columns: Mapping[str, Array]) -> TaskRound:
         """Complete N tasks, each for itself.
 
         Args:
@@ -63,7 +64,7 @@ class Completion:
         Returns:
             The tasks; those that have no answer are no longer among the survivors, and have a fate.
         """
-        draws = Tasks(next(iter(columns.values())).shape[1])
+        draws = TaskRound(next(iter(columns.values())).shape[1])
         for name, values in columns.items():
             draws[name] = values if len(values) != 2 or not name.endswith("_xyz") else self._on_table(values)
         self._derive(draws)
@@ -74,7 +75,7 @@ class Completion:
         self._accept(draws, self._random)
         return draws
 
-    def rows(self, tasks: Tasks) -> dict[str, Array]:
+    def rows(self, tasks: TaskRound) -> dict[str, Array]:
         """Return the fields of completed tasks as a dataset stores them, of those that have an answer.
 
         Returns:
@@ -86,7 +87,7 @@ class Completion:
             for field in fields
         }
 
-    def _derive(self, draws: Tasks) -> None:
+    def _derive(self, draws: TaskRound) -> None:
         for name in self._derived:
             if name == "start_q":
                 draws[name] = np.repeat(self.context.robot.base[:, None], draws.size, axis=1)
@@ -94,7 +95,7 @@ class Completion:
                 (draws[name],) = self._tip(draws[name.replace("xyz", "q")])
 
     def _on_table(self, values: Array) -> Array:
-        return np.concatenate([values, np.full((1, values.shape[1]), self._height)])
+        return np.concatenate([values, np.full((1, values.shape[1]), self.height)])
 
 
 def _table_height(context: Context) -> float | None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import NAME, field
@@ -19,3 +20,15 @@ class Pipeline:
     )
     stage: tuple[Stage, ...] = field("the steps, in order", form="[[stage]] tables")
     path: Path = Path()
+
+
+def listed_tasks(pipeline: Pipeline) -> int | None:
+    """Return how many draws there are where a stage lists them; None where none does.
+
+    Raises:
+        RecipeError: More than one stage lists them.
+    """
+    listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
+    if len(listed) > 1:
+        raise RecipeError([f"{pipeline.path}: {len(listed)} stages list positions, expected one at most"])
+    return listed[0] if listed else None

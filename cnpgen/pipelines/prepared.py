@@ -12,7 +12,7 @@ from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.piece import Block, Piece
-from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
 from cnpgen.pipelines.stages.stage import Array, Round
 from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import EXACTNESS
@@ -145,18 +145,6 @@ class PreparedPipeline:
             reasons = ", ".join(f"{reason} ({count / draws.size:.1%})" for count, reason in worst if count)
             text = f"{made} of {tried:,} draws were accepted; of the last {draws.size:,}, rejected for {reasons}"
             raise RecipeError([f"{self.pipeline.path}: {text}"])
-
-
-def listed_tasks(pipeline: Pipeline) -> int | None:
-    """Return how many draws there are where a stage lists them; None where none does.
-
-    Raises:
-        RecipeError: More than one stage lists them.
-    """
-    listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
-    if len(listed) > 1:
-        raise RecipeError([f"{pipeline.path}: {len(listed)} stages list positions, expected one at most"])
-    return listed[0] if listed else None
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:

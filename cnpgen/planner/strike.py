@@ -12,9 +12,10 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.load import restore_pipeline
 from cnpgen.pipelines.stages.behind_puck import behind
 from cnpgen.pipelines.stages.hitting_velocity import SHARE
-from cnpgen.pipelines.stages.stage import Tasks
+from cnpgen.pipelines.stages.stage import TaskRound
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.model import Model
+from cnpgen.planner.requests import CERTIFIED
 from cnpgen.plans.plans import Plans
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -54,15 +55,16 @@ def load_completion(model: Model, backend: str | None) -> Completion:
     stages = model.training.get("stages")
     if stages is None:
         raise UsageError("the model does not say how the rows were drawn that it was trained on: it cannot strike")
+    drawing = [stage for stage in stages if stage.get("use") != CERTIFIED]
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with surroundings(model.problem, backend) as given:
         context = Context(given.problem, given.robot, given.kernels)
-        return Completion(restore_pipeline(name, stages, given.problem), context, GIVEN)
+        return Completion(restore_pipeline(name, drawing, given.problem), context, GIVEN)
 
 
 def strike_tasks(
     completion: Completion, state: State, puck: ArrayLike, towards: ArrayLike, *, meeting: float, share: ArrayLike
-) -> Tasks:
+) -> TaskRound:
     """Complete strikes; see ``Planner.strike``."""
     n = completion.context.robot.n
     if np.ndim(state[0]) == 0 or len(state) != 3:
@@ -78,7 +80,7 @@ def strike_tasks(
     return completion({name: _repeated(values, count) for name, values in zip(GIVEN, columns, strict=True)})
 
 
-def boundary_of_tasks(tasks: Tasks) -> Boundary:
+def boundary_of_tasks(tasks: TaskRound) -> Boundary:
     """Return the boundary conditions of the tasks that have an answer."""
     names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
     return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))

@@ -55,6 +55,12 @@ def test_columns_of_a_wrong_shape_are_refused(columns, message):
         complete("airhockey-hit", **columns)
 
 
+def test_without_a_table_positions_need_all_three_coordinates():
+    with pytest.raises(UsageError, match=r"goal_xyz must have shape \(3,\) or \(N, 3\), got \(2,\)"):
+        complete("heavy-object", start_xyz=[0.4, -0.4, 0.3], goal_xyz=[0.4, 0.4])
+    assert complete("heavy-object", start_xyz=[0.4, -0.4, 0.3], goal_xyz=[0.4, 0.4, 0.3]).reasons == ("",)
+
+
 def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
     lines = [
         "goal_xyz.x, goal_xyz.y ,hit_angle",
@@ -105,6 +111,9 @@ def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_pat
         file["goal_xyz"], file["hit_angle"] = np.zeros((2, 3)), [0.0]
     with h5py.File(tmp_path / "text.h5", "w") as file:
         file["goal_xyz"] = "here"
-    for name, message in (("long", "one value per task each, got goal_xyz"), ("text", "goal_xyz must hold numbers, got object")):
+    for name, message in (
+        ("long", "one value per task each, got goal_xyz"),
+        ("text", "goal_xyz must hold numbers, got object"),
+    ):
         with pytest.raises(DatasetError, match=message):
             complete_table("airhockey-replan", tmp_path / f"{name}.h5")

@@ -93,6 +93,12 @@ def test_what_makes_no_sense_is_refused_by_name(planner, arguments, message):
         planner.strike(*arguments)
 
 
+def test_a_model_of_certified_rows_strikes_without_solving_anything(planner, state):
+    stages = [*planner.model.training["stages"], {"use": "certified-plan"}]
+    certified = Planner(replace(planner.model, training={**planner.model.training, "stages": stages}))
+    assert certified.strike(state, PUCKS, TARGET).reasons == planner.strike(state, PUCKS, TARGET).reasons
+
+
 def test_models_of_other_tasks_or_of_unknown_rows_cannot_strike(planner):
     state = (np.zeros(7),) * 3
     with pytest.raises(UsageError, match="'heavy-object' has no column to give 'hit_angle'"):

@@ -131,7 +131,7 @@ class Stage(ABC):
         """Prepare the stage for tasks whose columns are partly given: what is given stays, what is not is found.
 
         By default a stage has nothing to do where all that it takes is given, and does its own work where nothing is.
-        What it draws is then always the middle of what it could be (see ``Tasks``).
+        What it draws is then always the middle of what it could be (see ``TaskRound``).
 
         Args:
             context: As of ``prepare``.
@@ -151,7 +151,7 @@ def leave(draws: Round, random: np.random.Generator) -> None:
     """Do nothing: what the stage would find is given."""
 
 
-class Tasks(Round):
+class TaskRound(Round):
     """Tasks in the place of draws: nothing of them is random.
 
     What a stage still draws, since it is not given, is the middle of all that it could be, for every task: no noise.
