@@ -2,8 +2,8 @@
 
 Our own: the wheels of OMPL have no constructor of its SST for Python. A state is (q, dq), a control an acceleration
 that is held for 1 to 20 steps of 5 ms and must be within the torque limits, the distance the tip's in the workspace,
-and the cost time; the goal is a place of the tip alone, as the paper's authors simplified it. Where no state comes near enough
-to the goal, what comes nearest counts. Random torques were tried: they break a velocity limit within 5 ms.
+and the cost time; the goal is a place of the tip alone, as the paper's authors simplified it. Where no state comes near
+enough to the goal, what comes nearest counts. Random torques were tried: they break a velocity limit within 5 ms.
 """
 
 from dataclasses import dataclass
