@@ -53,12 +53,18 @@ def machine_text(report: "MachineReport") -> str:
         "variables": settings or "none that matter is set",
         "compiler": report.compiler or "none",
         "backend": f"{report.backend or 'none'}: {report.backend_reason}",
-        "cache": f"{report.cache_folder} ({'writable' if report.cache_writable else 'not writable'})",
+        "cache": f"{report.cache_folder} ({_cache(report)})",
         "recipes": report.recipes,
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),
     }
     return "\n".join(f"{name:<10} {_folded(value)}" for name, value in facts.items())
+
+
+def _cache(report: "MachineReport") -> str:
+    if report.cache_writable:
+        return "writable"
+    return "only read" if report.cache_used else "not used"
 
 
 def _verdict(report: "MachineReport") -> str:

@@ -2,16 +2,17 @@
 
 import argparse
 import sys
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.interruption import raise_if_interrupted
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from cnpgen.make.dataset import MadeDataset
@@ -43,6 +44,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    add_engine(parser)
     option(
         "--shard-size",
         metavar="R",
@@ -79,10 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         print(blueprint_text(recipe, **_settings(arguments), force=arguments.force))
         return 0
-    try:
-        _make(recipe, arguments)
-    except KeyboardInterrupt as interruption:
-        raise type(interruption)(KEPT) from interruption
+    _make(recipe, arguments)
     return 0
 
 
@@ -94,7 +93,36 @@ def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
 def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
     from cnpgen.make.dataset import make_dataset
 
-    meter = Meter(quiet=arguments.quiet)
+    make = partial(
+        make_dataset,
+        recipe,
+        arguments.out,
+        n=arguments.n,
+        seed=arguments.seed,
+        workers=arguments.workers,
+        engine=arguments.engine,
+        address=arguments.address,
+        shard_size=arguments.shard_size,
+        dtype=arguments.dtype,
+        backend=arguments.backend,
+        force=arguments.force,
+        part=arguments.part,
+    )
+    make_metered(make, quiet=arguments.quiet, part=arguments.part)
+
+
+def make_metered(
+    make: "Callable[..., MadeDataset]", *, quiet: bool, part: tuple[int, int] | None = None, verb: str = "made"
+) -> None:
+    """Make a dataset with progress and a summary on stderr, and print its folder.
+
+    Args:
+        make: Takes ``begin`` and ``progress``, as ``make_dataset`` does.
+        quiet: Whether to show neither.
+        part: Which part of the dataset is made.
+        verb: What was done to the rows.
+    """
+    meter = Meter(quiet=quiet)
 
     def begin(step: str, folder: "Path", rows: int, there: int) -> None:
         raise_if_interrupted()
@@ -105,31 +133,20 @@ def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
         meter(rows, fates)
 
     try:
-        made = make_dataset(
-            recipe,
-            arguments.out,
-            n=arguments.n,
-            seed=arguments.seed,
-            workers=arguments.workers,
-            shard_size=arguments.shard_size,
-            dtype=arguments.dtype,
-            backend=arguments.backend,
-            force=arguments.force,
-            part=arguments.part,
-            begin=begin,
-            progress=count,
-        )
+        made = make(begin=begin, progress=count)
     except Exception:
         raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
         raise
+    except KeyboardInterrupt as interruption:
+        raise type(interruption)(KEPT) from interruption
     finally:
         meter.close()
-    if not arguments.quiet:
-        print("\n".join(_summary(made, meter, arguments.part)), file=sys.stderr)
+    if not quiet:
+        print("\n".join(_summary(made, meter, part, verb)), file=sys.stderr)
     print(made.folder)
 
 
-def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) -> list[str]:
+def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None, verb: str) -> list[str]:
     """Say in a few lines what was done."""
     import textwrap
 
@@ -143,7 +160,7 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None) ->
     share = "" if made.made == wanted else f"the missing {made.made:,} of "
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
-    lines = [f"made {share}{text} {times}{rest}"]
+    lines = [f"{verb} {share}{text} {times}{rest}"]
     lines += [_yield(meter.fates)] if meter.fates else []
     return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
 

@@ -82,6 +82,14 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
     parser.add_argument("--debug", action="store_true", default=default, help="show the traceback of an error")
 
 
+def add_engine(parser: Options) -> None:
+    """Add ``--engine`` and ``--address``: where the workers run."""
+    text = "where the workers run: processes of this machine (loky, default), or a cluster (docs/scale.md)"
+    parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
+    text = "of the cluster's scheduler or head, such as tcp://host:8786; without it one is started on this machine"
+    parser.add_argument("--address", metavar="A", help=text)
+
+
 def add_json(parser: Parser) -> None:
     """Add ``--json``."""
     parser.add_argument("--json", action="store_true", help="write JSON")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.refine_options import REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import counted
@@ -45,6 +45,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--refine", action="store_true", help="polish the plans")
     refining = parser.add_argument_group("with --refine")
     refining.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
+    add_engine(refining)
     add_refining(refining)
 
 
@@ -76,7 +77,11 @@ def _check(arguments: argparse.Namespace) -> None:
     from cnpgen.errors import UsageError
 
     default = arguments.parser.get_default
-    lost = [name for name in ("workers", "explain", *REFINING) if getattr(arguments, name) != default(name)]
+    lost = [
+        name
+        for name in ("workers", "engine", "address", "explain", *REFINING)
+        if getattr(arguments, name) != default(name)
+    ]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} is for --refine, which is missing")
     check_suffix(arguments.out)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Options, Parser, add_json
+from cnpgen.cli.parser import Options, Parser, add_engine, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import counted
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.plans import Refinement
 
-REFINING = ("objective", "weight", "max_iterations", "tolerance", "step")  # what add_refining adds
+REFINING = ("objective", "weight", "max_iterations", "tolerance", "step", "deadline")  # what add_refining adds
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
@@ -37,6 +37,7 @@ def add_options(parser: Parser) -> None:
     """Add the options of both commands."""
     add_refining(parser)
     parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
+    add_engine(parser)
     parser.add_argument(
         "--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part"
     )
@@ -63,6 +64,12 @@ def add_refining(parser: Options) -> None:
         " among obstacles a twentieth)",
     )
     option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms, which is the most)")
+    option(
+        "--deadline",
+        metavar="S",
+        type=values.seconds,
+        help="how long each plan may take, 10ms for example: the best valid one until then, never worse than the given",
+    )
     option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")
 
 
@@ -104,6 +111,8 @@ def refine_and_save(
             plans,
             options=options,
             workers=arguments.workers,
+            engine=arguments.engine,
+            address=arguments.address,
             journal=journal,
             discard=arguments.force,
             begin=lambda total, there: meter.begin(title, total, there),

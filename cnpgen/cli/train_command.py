@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise type(interruption)(kept) from interruption
     finally:
         watch.close()
-    if trained.made:
+    if trained.made or not trained.path.with_suffix(".png").exists():  # a run may have ended just before it was drawn
         _draw(trained)
     if not arguments.quiet:
         print(summary(trained), file=sys.stderr)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def add(commands: "Commands[Parser]") -> None:
         help="make K random blocks, or all if there are fewer, again from the seed and compare them",
     )
     option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
+    add_engine(parser)
     option("--quiet", action="store_true", help="no progress and no summary: nothing at all if nothing is wrong")
     add_json(parser)
 
@@ -65,7 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _validate(arguments: argparse.Namespace) -> "ValidationReport":
     from cnpgen.validate.dataset import validate_dataset
 
-    options = {"deep": arguments.deep, "regenerate": arguments.regenerate, "workers": arguments.workers}
+    names = ("deep", "regenerate", "workers", "engine", "address")
+    options = {name: getattr(arguments, name) for name in names}
     rows = _rows(arguments.folder) if arguments.deep else 0
     if not rows:
         return validate_dataset(arguments.folder, **options)
@@ -87,4 +89,4 @@ def _rows(folder: Path) -> int:
         blueprint = load_blueprint(folder)
     except DatasetError:
         return 0
-    return sum(task.rows for task in shards(blueprint) if is_committed(folder, task, blueprint.fingerprint))
+    return sum(task.rows for task in shards(blueprint) if is_committed(folder, task, blueprint.of(task).fingerprint))

@@ -7,9 +7,11 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import MachineError
+from cnpgen.kernels.cache import LIBRARIES, is_trusted, keep_from_others, make_private, require_trusted, warm_folder
 from cnpgen.kernels.emit import VECTORS, emit
 from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
@@ -25,6 +28,7 @@ from cnpgen.kernels.tape import Tape
 FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w")
 LONG = 6000  # instructions: above, GCC's register allocator takes minutes at -O2 and gains nothing
 COMPILE_SECONDS = 300
+VERSION_SECONDS = 10
 _LOG = logging.getLogger(__name__)
 
 
@@ -40,7 +44,7 @@ class CompiledKernel(Kernel):
         n = check_arguments(self.tape, arguments)
         results = [np.empty((width, n)) for width in self.tape.outputs]
         if n:
-            strides = (ctypes.c_long * len(arguments))(*[argument.strides[0] // 8 for argument in arguments])
+            strides = _array_type(ctypes.c_long, len(arguments))(*[argument.strides[0] // 8 for argument in arguments])
             self._function(ctypes.c_long(n), _pointers(arguments), strides, _pointers(results))
         return results
 
@@ -72,11 +76,19 @@ def _load(library: Path) -> Any:
 def _distances(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_long]":
     """Distances from component to component and from node to node, in numbers; 0 where there are no nodes."""
     flat = (stride // array.itemsize for array in arrays for stride in (*array.strides, 0)[:2])
-    return (ctypes.c_long * (2 * len(arrays)))(*flat)
+    found: ctypes.Array[ctypes.c_long] = _array_type(ctypes.c_long, 2 * len(arrays))(*flat)
+    return found
 
 
 def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
-    return (ctypes.c_void_p * len(arrays))(*map(_address, arrays))
+    found: ctypes.Array[ctypes.c_void_p] = _array_type(ctypes.c_void_p, len(arrays))(*map(_address, arrays))
+    return found
+
+
+@cache
+def _array_type(kind: Any, count: int) -> Any:
+    """Return ``kind * count``; ctypes makes the type anew, in several microseconds, where nobody keeps it."""
+    return kind * count
 
 
 def _address(array: Any) -> int:
@@ -130,13 +142,33 @@ def compiler_version(compiler: str) -> str:
     Raises:
         MachineError: The compiler does not run.
     """
-    try:
-        done = subprocess.run(
-            [*shlex.split(compiler), "--version"], capture_output=True, text=True, timeout=30, check=True
-        )
-    except (OSError, subprocess.SubprocessError) as error:
-        raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
+    done = _run([*shlex.split(compiler), "--version"], VERSION_SECONDS, "to say its version")
+    if done.returncode != 0:
+        raise MachineError(f"the C compiler {compiler} does not run: --version ends with exit code {done.returncode}")
     return done.stdout.splitlines()[0].strip() if done.stdout else "unknown"
+
+
+def _run(command: list[str], seconds: float, what: str) -> "subprocess.CompletedProcess[str]":
+    """Run a compiler; where it takes too long, or this process is interrupted, end it with all that it has started.
+
+    Raises:
+        MachineError: It does not run, or takes longer.
+    """
+    pipe = subprocess.PIPE
+    try:
+        process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, errors="replace", process_group=0)
+    except OSError as error:
+        raise MachineError(f"the C compiler {command[0]} does not run: {error}") from error
+    with process:
+        try:
+            out, errors = process.communicate(timeout=seconds)
+        except BaseException as error:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise MachineError(f"the C compiler {command[0]} took more than {seconds:g} s {what}") from error
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, errors)
 
 
 @cache
@@ -177,8 +209,12 @@ def library_stem(tape: Tape, compiler: str) -> str:
 
 
 def find_library(folder: Path, stem: str) -> Path | None:
-    """Return a library whose content is what its file name says, or None; loading a damaged one would be fatal."""
-    return next((path for path in folder.glob(f"{stem}-*.so") if path.stem == f"{stem}-{_content_digest(path)}"), None)
+    """Return a library that nobody else may have changed and whose content is what its file name says, or None.
+
+    Loading a damaged one would be fatal.
+    """
+    found = (path for path in folder.glob(f"{stem}-*.so") if is_trusted(path))
+    return next((path for path in found if path.stem == f"{stem}-{_content_digest(path)}"), None)
 
 
 def _content_digest(path: Path) -> str:
@@ -189,45 +225,54 @@ def find_compiled(tape: Tape, cache_folder: Path) -> Path | None:
     """Return the library of a tape if it is in the cache.
 
     Raises:
-        MachineError: There is no working compiler or the cache folder cannot be read.
+        MachineError: There is no working compiler, or the cache folder cannot be read or may be changed by others.
     """
-    libraries = cache_folder / "lib"
+    stem = library_stem(tape, require_compiler())
     try:
-        return find_library(libraries, library_stem(tape, require_compiler()))
+        found = (find_library(folder / LIBRARIES, stem) for folder in require_trusted(cache_folder))
+        return next((library for library in found if library), None)
     except OSError as error:
-        raise MachineError(f"cannot use the kernel cache {libraries}: {error.strerror or error}") from error
+        raise _unusable(cache_folder, error) from error
 
 
 def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     """Return the library of a tape, compiling it if it is not in the cache or damaged there.
 
     Raises:
-        MachineError: There is no working compiler or the cache folder cannot be written.
+        MachineError: There is no working compiler, or the cache folder cannot be written or may be changed by others.
     """
     if found := find_compiled(tape, cache_folder):
         return found
     compiler = require_compiler()
-    libraries, stem = cache_folder / "lib", library_stem(tape, compiler)
+    libraries, stem = cache_folder / LIBRARIES, library_stem(tape, compiler)
     try:
-        _LOG.info("compiling kernels, once per problem and machine")
-        libraries.mkdir(parents=True, exist_ok=True)
+        _announce(cache_folder)
+        make_private(libraries)
+        require_trusted(cache_folder)
         with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
             source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"
             source.write_text(emit(tape), encoding="utf-8")
             _run_compiler(compiler, optimisation(tape), source, built)
+            keep_from_others(built)
             return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
     except OSError as error:
-        raise MachineError(f"cannot use the kernel cache {libraries}: {error.strerror or error}") from error
+        raise _unusable(cache_folder, error) from error
+
+
+def _unusable(cache_folder: Path, error: OSError) -> MachineError:
+    return MachineError(f"cannot use the kernel cache {cache_folder / LIBRARIES}: {error.strerror or error}")
+
+
+def _announce(cache_folder: Path) -> None:
+    if warm := warm_folder(cache_folder):
+        _LOG.info("compiling kernels for this run only: the cache %s lacks them and cannot be written", warm)
+    else:
+        _LOG.info("compiling kernels, once per problem and machine")
 
 
 def _run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
     command = [*shlex.split(compiler), *FLAGS, level, *vector_flags(), str(source), "-o", str(built), "-lm"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise MachineError(f"{compiler} took more than {COMPILE_SECONDS} s for {source.name}") from error
-    except OSError as error:
-        raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
+    done = _run(command, COMPILE_SECONDS, f"for {source.name}")
     if done.returncode != 0 or not built.exists():
         first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
         raise MachineError(f"{compiler} failed with exit code {done.returncode}: {first or 'no message'}")

@@ -14,7 +14,15 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.cache import default_cache_folder, writable_folder
+from cnpgen.kernels.cache import (
+    TAPES,
+    default_cache_folder,
+    is_trusted,
+    keep_from_others,
+    make_private,
+    require_trusted,
+    usable_folder,
+)
 from cnpgen.kernels.compiled import CompiledGridKernel, CompiledKernel, compile_tape, require_compiler
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
@@ -128,14 +136,28 @@ class KernelLibrary:
             "parameters": parameters,
         }
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
-        path = self.cache_folder / "tape" / f"{builder.__name__}-{digest[:24]}.npy"
-        try:
-            return Tape.from_bytes(path.read_bytes())
-        except (OSError, ValueError):
+        name = f"{builder.__name__}-{digest[:24]}.npy"
+        if (tape := self._cached(name)) is None:
             tape = tape_from_function(builder(**given, **parameters), loop, grid=grid, dtype=dtype)
-            with suppress(MachineError):  # a cache that cannot be written only costs time
-                write_file(path, tape.to_bytes())
-            return tape
+            self._keep(name, tape)
+        return tape
+
+    def _cached(self, name: str) -> Tape | None:
+        """Return a tape that is in the cache; damaged ones, and those that others may have changed, do not count."""
+        for folder in require_trusted(self.cache_folder):
+            path = folder / TAPES / name
+            with suppress(OSError, ValueError):
+                if is_trusted(path):
+                    return Tape.from_bytes(path.read_bytes())
+        return None
+
+    def _keep(self, name: str, tape: Tape) -> None:
+        """Write a tape to the cache; one that cannot be written only costs time."""
+        path = self.cache_folder / TAPES / name
+        with suppress(MachineError, OSError):
+            make_private(path.parent)
+            write_file(path, tape.to_bytes())
+            keep_from_others(path)
 
 
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
@@ -187,7 +209,7 @@ def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
     """
     if wanted is not None and wanted not in BACKENDS:
         raise UsageError(f"backend {wanted!r} does not exist: expected one of {', '.join(BACKENDS)}")
-    folder = writable_folder(default_cache_folder())
+    folder = usable_folder(default_cache_folder())
     if wanted == "numpy":
         return "numpy", folder
     if wanted == "casadi":

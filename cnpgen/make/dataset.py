@@ -10,14 +10,13 @@ from itertools import groupby
 from pathlib import Path
 
 from cnpgen.errors import UsageError
-from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.blueprint import dataset_folder, draw_up
 from cnpgen.make.certify import certified
 from cnpgen.make.load import as_dataset_recipe, load_notes
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.shards import Job, make_shards
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
-from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import Blueprint, ShardTask, shards
 from cnpgen.store.check import check_documents
 from cnpgen.store.fates import Fates
@@ -68,6 +67,8 @@ def make_dataset(
     n: int | None = None,
     seed: int | None = None,
     workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
     shard_size: int | None = None,
     dtype: str = "float64",
     backend: str | None = None,
@@ -80,8 +81,7 @@ def make_dataset(
     """Make a dataset, or finish one that was interrupted.
 
     What is there already is compared with its recorded sha256; what is damaged is made again, after a warning.
-    Workers run on joblib: its default is one process per core; inside ``joblib.parallel_config(backend="dask")`` or
-    any other registered backend they run there.
+    Workers are processes of this machine by default, or of a cluster (docs/scale.md): the bytes are the same.
 
     Args:
         recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a loaded recipe.
@@ -89,7 +89,10 @@ def make_dataset(
         n: Rows over all splits; default the recipe's. Fewer rows are the first of each split.
         seed: Root seed; default the recipe's.
         workers: Processes; default one per available core, or one where so few rows are missing that a second would
-            not pay.
+            not pay; of a cluster as many as it has.
+        engine: "loky": processes of this machine; "dask" or "ray": a cluster, whose workers see the same folder. By
+            default loky, or the backend that ``joblib.parallel_config`` names.
+        address: Of the cluster's scheduler or head; by default a cluster on this machine, for this call.
         shard_size: Rows per shard; default between 8192 and 65536, of certified datasets between 64 and 1024.
         dtype: "float64" or "float32", what rows are stored as and validated as.
         backend: "compiled", "numpy" or "casadi"; default the fastest that works.
@@ -107,7 +110,8 @@ def make_dataset(
         MachineError: No working backend, a full disk, a dead worker; run again to go on.
         DatasetError: The plan.json in the folder is damaged.
     """
-    _check(workers, part, force=force)
+    where = Engine(engine, address, workers)
+    _check(part, force=force)
     loaded = as_dataset_recipe(recipe)
     loaded = certified(loaded) if certify else loaded
     notes = load_notes(loaded)
@@ -116,16 +120,37 @@ def make_dataset(
     check_place(workspace)
     job = draw_up(loaded, workspace, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, force=force)
     job = replace(job, blueprint=open_workspace(folder, job.blueprint, force=force))
-    tasks = shards(job.blueprint)
-    mine = _part(tasks, part)
+    return carry_out(job, notes, engine=where, part=part, begin=begin, progress=progress)
+
+
+def carry_out(
+    job: Job,
+    notes: str,
+    *,
+    engine: Engine,
+    part: tuple[int, int] | None = None,
+    begin: Begin | None = None,
+    progress: Progress | None = None,
+) -> MadeDataset:
+    """Make what is missing of a dataset whose blueprint is written, and finish it if all of it is there then.
+
+    Args:
+        job: The dataset.
+        notes: Its data card.
+        engine: Where the work is shared out to.
+        part: As of ``make_dataset``, like all that follow.
+        begin: Called before rows are compared and before they are made.
+        progress: Called with the rows of every shard.
+    """
+    mine = _part(shards(job.blueprint), part)
     waiting, damaged = _take_stock(job, mine, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in mine)
-        begin("making", folder, rows, rows - sum(task.rows for task in waiting))
-    made = _make(job, waiting, workers, progress)
-    complete, documents = _finish(job, notes, made=made, alone=part is None)
+        begin("making", job.folder, rows, rows - sum(task.rows for task in waiting))
+    made = _make(job, waiting, engine, progress)
+    complete, documents = finish(job.folder, job.blueprint, notes, made=made, alone=part is None)
     rows_of = {split: sum(task.rows for task in mine if task.split == split) for split in job.blueprint.splits}
-    return MadeDataset(folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
+    return MadeDataset(job.folder, job.blueprint, made, complete, rows_of, (*damaged, *documents))
 
 
 def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
@@ -156,10 +181,10 @@ def _take_stock(
     return [task for task in tasks if task not in sound], [task.file for task in damaged]
 
 
-def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progress | None) -> int:
+def _make(job: Job, tasks: list[ShardTask], engine: Engine, progress: Progress | None) -> int:
     """Make the shards; return their rows."""
     made = 0
-    with closing(_results(job, tasks, workers)) as results:
+    with closing(_results(job, tasks, engine)) as results:
         for rows, fates in results:
             made += rows
             if progress is not None:
@@ -167,18 +192,26 @@ def _make(job: Job, tasks: list[ShardTask], workers: int | None, progress: Progr
     return made
 
 
-def _results(job: Job, tasks: list[ShardTask], workers: int | None) -> Generator[tuple[int, Fates], None, None]:
+def _results(job: Job, tasks: list[ShardTask], engine: Engine) -> Generator[tuple[int, Fates], None, None]:
     """Make the shards and yield what became of them as they are committed."""
-    workers = worker_count(1 if workers is None and is_quick(job.blueprint, tasks) else workers, len(tasks))
-    groups = runs(job.blueprint, tasks, workers)
-    if workers == 1:
-        for group in groups:
-            yield from make_shards(job, group)
+    if not tasks:
         return
-    advice = f": the shards that are finished are safe in {job.folder}; {AGAIN} to go on"
-    with closing(share_out(partial(_made, job), groups, workers, advice=advice)) as results:
-        for made in results:
-            yield from made
+    with assembled(engine, len(tasks), quick=is_quick(job.blueprint, tasks)) as team:
+        groups = runs(job.blueprint, tasks, team.size)
+        if team.size == 1 and not team.is_far:
+            for group in groups:
+                yield from make_shards(job, group)
+            return
+        theirs = _for_others(job) if team.is_far else job
+        advice = f": the shards that are finished are safe in {job.folder}; {AGAIN} to go on"
+        with closing(team.share_out(partial(_made, theirs), groups, advice=advice)) as results:
+            for made in results:
+                yield from made
+
+
+def _for_others(job: Job) -> Job:
+    """Return a job as a machine can do it that sees the same folder, but perhaps no other files of this one."""
+    return replace(job, folder=job.folder.absolute(), pipeline=None, cache_folder=None)
 
 
 def _made(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, Fates]]:
@@ -202,33 +235,32 @@ def runs(blueprint: Blueprint, tasks: list[ShardTask], workers: int) -> list[lis
     return [list(group) for _, group in groupby(tasks, key=lambda task: (task.split, task.first_row // rows))]
 
 
-def _finish(job: Job, notes: str, *, made: int, alone: bool) -> tuple[bool, list[str]]:
+def finish(folder: Path, blueprint: Blueprint, notes: str, *, made: int, alone: bool) -> tuple[bool, list[str]]:
     """Write the documents of a dataset whose shards are all there; return whether they are, and what was damaged.
 
     Args:
-        job: The dataset.
+        folder: The dataset.
+        blueprint: Its blueprint.
         notes: Its data card.
         made: Rows that this call has made.
         alone: Whether nobody else is making parts of it, who might be about to write the documents.
     """
-    if pending(job.folder, job.blueprint):
+    if pending(folder, blueprint):
         return False, []
-    sealed, damaged = (job.folder / MANIFEST).exists(), list[str]()
+    sealed, damaged = (folder / MANIFEST).exists(), list[str]()
     if made == 0 and (sealed or alone):
-        findings = check_documents(job.folder, job.blueprint)
+        findings = check_documents(folder, blueprint)
         if not findings:
             return True, []
         damaged = list(dict.fromkeys(finding.file for finding in findings))
         if sealed:  # without a manifest the dataset was unfinished: a run may have ended just before
             warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
-    finalize(job.folder, job.blueprint, notes=notes)
+    finalize(folder, blueprint, notes=notes)
     return True, damaged
 
 
-def _check(workers: int | None, part: tuple[int, int] | None, *, force: bool) -> None:
+def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     """Refuse arguments and an environment that make no sense before anything is touched."""
-    if workers is not None:
-        integer("workers", workers, least=1)
     if part is not None:
         _check_part(part)
     if force and part is not None:

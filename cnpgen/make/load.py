@@ -1,5 +1,8 @@
 """Dataset recipes from files, by name or path, and from the blueprints of datasets."""
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,6 +12,7 @@ from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import read_pipeline
 from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.prepared import listed_tasks
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
@@ -18,12 +22,14 @@ from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import is_kind, read_table
+from cnpgen.store.blueprint import Blueprint
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
     """Load a dataset recipe, its pipeline and its problem.
 
-    A pipeline can be given as well: it becomes version 1.0.0 of a dataset of its name, 90 % training, 10 % validation.
+    A pipeline can be given as well: it becomes version 1.0.0 of a dataset of its name, 90 % training, 10 % validation;
+    one that lists its tasks becomes one of training rows.
 
     Args:
         name_or_path: Name of a shipped dataset or pipeline, or path of such a file.
@@ -84,6 +90,18 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     return replace(made, path=path)
 
 
+@contextmanager
+def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
+    """Rebuild the recipe from a blueprint, its URDF in a temporary folder that is gone when the block ends.
+
+    Raises:
+        RecipeError: It does not fit this version of cnpgen.
+        PluginError: It needs packages that are not installed.
+    """
+    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+        yield restore_dataset_recipe(dict(blueprint.recipe), str(blueprint.robot["urdf"]), Path(folder))
+
+
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
     table = read_table(path, ("dataset", "pipeline"), mistakes)
     if table is None:
@@ -102,7 +120,7 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         name=pipeline.name,
         title=pipeline.title,
         pipeline=pipeline,
-        splits={"train": 90, "validation": 10},
+        splits={"train": 90, "validation": 10} if (tasks := listed_tasks(pipeline)) is None else {"train": tasks},
         path=pipeline.path,
     )
 

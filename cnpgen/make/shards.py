@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.library import Backend
+from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
+from cnpgen.make.load import restored
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
@@ -33,21 +35,30 @@ class Job:
     Attributes:
         folder: The dataset.
         blueprint: What it will hold.
-        pipeline: The recipe.
+        pipeline: The recipe; None where it is that of the blueprint: a worker elsewhere may not find its files.
         backend: Which kernels run.
-        cache_folder: Where they are cached.
+        cache_folder: Where they are cached; None where the machine that makes them caches them.
     """
 
     folder: Path
     blueprint: Blueprint
-    pipeline: Pipeline
+    pipeline: Pipeline | None
     backend: Backend
-    cache_folder: Path
+    cache_folder: Path | None
 
 
 def prepare(job: Job) -> PreparedPipeline:
-    """Load the stages of what is made."""
-    return PreparedPipeline(job.pipeline, backend=job.backend, cache_folder=job.cache_folder, dtype=job.blueprint.dtype)
+    """Load the stages of what is made.
+
+    Raises:
+        MachineError: The backend does not work on this machine.
+    """
+    cache_folder = choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
+    load = partial(PreparedPipeline, backend=job.backend, cache_folder=cache_folder, dtype=job.blueprint.dtype)
+    if job.pipeline is not None:
+        return load(job.pipeline)
+    with restored(job.blueprint) as recipe:
+        return load(recipe.pipeline)
 
 
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Fates]]:

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import counted
+from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.machine.versions import __version__
-from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import settle_tips
@@ -89,6 +89,8 @@ def solve_plans(
     *,
     options: RefineOptions = DEFAULT,
     workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
     journal: str | Path | None = None,
     discard: bool = False,
     begin: Callable[[int, int], None] | None = None,
@@ -100,6 +102,8 @@ def solve_plans(
         problems: The boundary problems, as ``draw_boundary_problems`` and ``load_boundary_problems`` return them.
         options: As of ``refine_plans``, like all that follow.
         workers: Processes.
+        engine: Where they run.
+        address: Likewise.
         journal: Where finished plans are written down.
         discard: Whether what another run has written there may be thrown away.
         begin: Called once.
@@ -120,6 +124,8 @@ def solve_plans(
         unmade,
         options=options,
         workers=workers,
+        engine=engine,
+        address=address,
         journal=journal,
         discard=discard,
         begin=begin,
@@ -132,6 +138,8 @@ def refine_plans(
     *,
     options: RefineOptions = DEFAULT,
     workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
     journal: str | Path | None = None,
     discard: bool = False,
     begin: Callable[[int, int], None] | None = None,
@@ -147,6 +155,9 @@ def refine_plans(
         plans: The plans.
         options: How to refine.
         workers: Processes; default one per available core, or one where a second would not pay.
+        engine: "loky": processes of this machine; "dask" or "ray": a cluster. By default loky, or the backend that
+            ``joblib.parallel_config`` names.
+        address: Of the cluster's scheduler or head; by default a cluster on this machine, for this call.
         journal: A file where finished plans are written down, and from which an interrupted run goes on.
         discard: Whether what another run has written there may be thrown away.
         begin: Called once with the number of plans and of those that the journal holds.
@@ -158,7 +169,7 @@ def refine_plans(
         MachineError: A worker died, or the journal cannot be written.
     """
     check_plans_type(plans)
-    watch = Stopwatch()
+    watch, where = Stopwatch(), Engine(engine, address, workers)
     plans = settle_tips(plans)
     notes = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
     done: dict[int, Refined] = {} if notes is None else dict(notes.finished)
@@ -166,7 +177,7 @@ def refine_plans(
         begin(len(plans), len(done))
     try:
         waiting = [i for i in range(len(plans)) if i not in done]
-        for found in _run(plans, waiting, options, workers, journal=notes, watch=watch):
+        for found in _run(plans, waiting, options, where, journal=notes, watch=watch):
             done |= found
             if progress is not None:
                 progress(len(found), sum(each.valid for each in found.values()))
@@ -180,30 +191,31 @@ def _run(
     plans: Plans,
     waiting: list[int],
     options: RefineOptions,
-    workers: int | None,
+    engine: Engine,
     *,
     journal: Journal | None,
     watch: Stopwatch,
 ) -> Iterator[dict[int, Refined]]:
     if not waiting:
         return
-    count = worker_count(1 if workers is None and len(waiting) <= ALONE else workers, -(-len(waiting) // PART))
-    size = PART if count > 1 else 1
-    parts = [waiting[first : first + size] for first in range(0, len(waiting), size)]
     prepare(plans, options)  # kernels are compiled once, not by every worker
     watch.prepared()
-    tasks = ((part, plans[np.array(part)]) for part in parts)
     advice = (
         ""
         if journal is None
         else f": {journal.path} holds what is finished; start again with the same arguments to go on"
     )
-    with closing(share_out(partial(_refine, options=options), tasks, count, advice=advice)) as results:
-        for part, refined, seconds in results:
-            watch.computing += seconds / count
-            if journal is not None:
-                journal.append(part, refined)
-            yield dict(zip(part, refined, strict=True))
+    with assembled(engine, -(-len(waiting) // PART), quick=len(waiting) <= ALONE) as team:
+        count = team.size
+        size = PART if count > 1 else 1
+        parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
+        tasks = ((part, plans[np.array(part)]) for part in parts)
+        with closing(team.share_out(partial(_refine, options=options), tasks, advice=advice)) as results:
+            for part, refined, seconds in results:
+                watch.computing += seconds / count
+                if journal is not None:
+                    journal.append(part, refined)
+                yield dict(zip(part, refined, strict=True))
 
 
 def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[list[int], list[Refined], float]:
@@ -222,7 +234,7 @@ def _assembled(given: Plans, refined: list[Refined], options: RefineOptions) -> 
         path_control_points=np.stack([each.path for each in refined]),
         rate_control_points=np.stack([each.rate for each in refined]),
         columns={**given.columns, **_columns(refined)},
-        refined_with=json.dumps({"cnpgen": __version__, **asdict(options)}),
+        refined_with=json.dumps({"cnpgen": __version__, **options.said()}),
     )
     valid, screened = np.array([each.valid for each in refined]), screen(plans)
     status = np.where(valid, PlanStatus.VALID, np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened))
@@ -249,7 +261,7 @@ def _identity(plans: Plans, options: RefineOptions) -> str:
     for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
         digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
     return json.dumps(
-        {"version": __version__, "options": asdict(options), "degree": plans.degree, "plans": digest.hexdigest()}
+        {"version": __version__, "options": options.said(), "degree": plans.degree, "plans": digest.hexdigest()}
     )
 
 

@@ -3,19 +3,39 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import canonical_sha256, load_document, plain, save_document
+from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Maybe, check_form
+from cnpgen.store.files.limits import MOST_COLUMNS, MOST_FIELDS, MOST_SHARDS
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
 FORMAT = "cnpgen-plan"
 REVISION = 2  # of the generator: raised by every change after which the same blueprint would give other rows
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # what was never extended is written as version 1, and has no "earlier"
+_FIELD = {
+    **dict.fromkeys(("name", "unit", "long_name", "role", "frame", "dtype"), TEXT),
+    "width": WHOLE,
+    "names": [TEXT],
+    "valid_min": Maybe([NUMBER]),
+    "valid_max": Maybe([NUMBER]),
+}
+FORM = {
+    **dict.fromkeys(("name", "version", "title", "license", "recipe_sha256", "dtype", "backend", "generator"), TEXT),
+    **dict.fromkeys(("fingerprint", "seed"), TEXT),
+    **dict.fromkeys(("shard_size", "block_rows", "revision"), WHOLE),
+    "recipe": {EVERY: ANYTHING},
+    "splits": {EVERY: WHOLE},
+    "fields": [_FIELD],
+    "robot": {EVERY: ANYTHING},
+    "versions": {EVERY: TEXT},
+}
 INFORMATIONAL = ("title", "license", "versions", "recipe")  # what may differ in equal blueprints; recipe_sha256 may not
 
 
@@ -84,6 +104,8 @@ class Blueprint:
         fields: The columns, in order.
         robot: Name, digest of the URDF, joint names and limits.
         versions: Versions of cnpgen, Python and libraries that drew it up; not part of its identity.
+        earlier: The splits that the dataset had before each of its extensions, the oldest first. Shards that were made
+            then end where it ended, and stay as they are.
     """
 
     name: str
@@ -103,10 +125,12 @@ class Blueprint:
     fields: tuple[Field, ...]
     robot: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    earlier: tuple[Mapping[str, int], ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("recipe", "splits", "robot", "versions"):  # as JSON will give them back
             object.__setattr__(self, name, plain(getattr(self, name)))
+        object.__setattr__(self, "earlier", tuple(map(plain, self.earlier)))
         _check_sizes(self)
         _check_names(self)
 
@@ -115,6 +139,17 @@ class Blueprint:
         """The sha256 over everything that determines the bytes of the shards."""
         identity = {key: value for key, value in to_json(self).items() if key not in INFORMATIONAL}
         return canonical_sha256(identity)
+
+    @cached_property
+    def generations(self) -> tuple["Blueprint", ...]:
+        """The blueprints that the dataset has had, the oldest first; this one is the last."""
+        before = enumerate(self.earlier)
+        return (*(replace(self, splits=rows, earlier=self.earlier[:number]) for number, rows in before), self)
+
+    def of(self, task: "ShardTask") -> "Blueprint":
+        """Return the blueprint that a shard is made by: the first one that has its rows."""
+        end = task.first_row + task.rows
+        return next((each for each in self.generations if end <= each.splits.get(task.split, 0)), self)
 
     @property
     def key(self) -> int:
@@ -153,9 +188,18 @@ def _check_sizes(blueprint: Blueprint) -> None:
         raise UsageError(f"the seed must not be negative, got {blueprint.seed}")
     if blueprint.dtype not in {"float64", "float32"}:
         raise UsageError(f"dtype must be 'float64' or 'float32', got {blueprint.dtype!r}")
+    count = sum(-(-rows // blueprint.shard_size) for rows in blueprint.splits.values())
+    if count > MOST_SHARDS:
+        raise UsageError(
+            f"{count:,} shards of {blueprint.shard_size:,} rows are too many, expected at most {MOST_SHARDS:,}:"
+            " choose a larger shard_size"
+        )
     if any(rows < 0 for rows in blueprint.splits.values()) or not any(blueprint.splits.values()):
         found = ", ".join(f"{name} {rows}" for name, rows in blueprint.splits.items())
         raise UsageError(f"the splits must have rows, got {found or 'none'}")
+    for smaller, larger in pairwise((*blueprint.earlier, blueprint.splits)):
+        if any(not 0 <= rows <= larger.get(split, 0) for split, rows in smaller.items()):
+            raise UsageError(f"a dataset does not shrink: its splits had {dict(smaller)}, then {dict(larger)}")
 
 
 def _check_names(blueprint: Blueprint) -> None:
@@ -163,8 +207,13 @@ def _check_names(blueprint: Blueprint) -> None:
         if not SPLIT_NAME.fullmatch(split):
             raise UsageError(f"a split is named with letters, digits and '_', starting with a letter; got {split!r}")
     names = [item.name for item in blueprint.fields]
-    if not names or len(set(names)) != len(names):
-        raise UsageError(f"the fields must have different names, got {names}")
+    if not names or len(set(names)) != len(names) or len(names) > MOST_FIELDS:
+        raise UsageError(f"the fields must have different names, from 1 to {MOST_FIELDS:,}, got {names!s:.200}")
+    for item in blueprint.fields:
+        widths = {len(part) for part in (item.valid_min, item.valid_max) if part is not None}
+        wrong = widths - {max(item.width, 1)} or (item.names and len(item.names) != item.width)
+        if wrong or item.width > MOST_COLUMNS or item.dtype not in {"float", "int64"}:
+            raise UsageError(f"the field {item.name!r} must have as many names and limits as columns: {item!r:.200}")
 
 
 def default_shard_size(rows: int, block_rows: int = 4096) -> int:
@@ -182,12 +231,20 @@ def default_shard_size(rows: int, block_rows: int = 4096) -> int:
 
 
 def shards(blueprint: Blueprint) -> list[ShardTask]:
-    """List the shards of a blueprint, split by split, in order; a split without rows has none."""
+    """List the shards of a blueprint, split by split, in order; a split without rows has none.
+
+    They begin at multiples of the shard size, and where an extension began.
+    """
     return [
-        ShardTask(split, index, first, min(blueprint.shard_size, rows - first))
+        ShardTask(split, index, first, end - first)
         for split, rows in blueprint.splits.items()
-        for index, first in enumerate(range(0, rows, blueprint.shard_size))
+        for index, (first, end) in enumerate(pairwise([*_beginnings(blueprint, split, rows), rows]))
     ]
+
+
+def _beginnings(blueprint: Blueprint, split: str, rows: int) -> list[int]:
+    before = {each.get(split, 0) for each in blueprint.earlier}
+    return sorted({*range(0, rows, blueprint.shard_size), *(end for end in before if 0 < end < rows)})
 
 
 def shard_attributes(blueprint: Blueprint, task: ShardTask) -> dict[str, str | int]:
@@ -200,8 +257,8 @@ def shard_attributes(blueprint: Blueprint, task: ShardTask) -> dict[str, str | i
         "first_sample_id": task.first_row,
         "rows": task.rows,
         "recipe_sha256": blueprint.recipe_sha256,
-        "plan_fingerprint": blueprint.fingerprint,
-        "plan_key": blueprint.key,
+        "plan_fingerprint": blueprint.of(task).fingerprint,
+        "plan_key": blueprint.of(task).key,
         "root_seed": str(blueprint.seed),
         "generator": blueprint.generator,
         "backend": blueprint.backend,
@@ -211,8 +268,9 @@ def shard_attributes(blueprint: Blueprint, task: ShardTask) -> dict[str, str | i
 
 def to_json(blueprint: Blueprint) -> dict[str, Any]:
     """Return a blueprint as a JSON-able dict."""
-    names = [name for name in Blueprint.__dataclass_fields__ if name not in {"fields", "seed"}]
+    names = [name for name in Blueprint.__dataclass_fields__ if name not in {"fields", "seed", "earlier"}]
     content = {"seed": str(blueprint.seed), "fields": [asdict(item) for item in blueprint.fields]}
+    content |= {"earlier": list(blueprint.earlier)} if blueprint.earlier else {}
     return {name: getattr(blueprint, name) for name in names} | {name: plain(value) for name, value in content.items()}
 
 
@@ -223,7 +281,9 @@ def from_json(content: Mapping[str, Any]) -> Blueprint:
         DatasetError: A key is missing or has the wrong type.
     """
     try:
-        arguments = {name: content[name] for name in Blueprint.__dataclass_fields__}
+        arguments = {name: content[name] for name in Blueprint.__dataclass_fields__ if name != "earlier"}
+        check_form(content.get("earlier", []), [{EVERY: WHOLE}])
+        arguments["earlier"] = tuple(content.get("earlier", ()))
         arguments["seed"] = int(content["seed"])
         arguments["fields"] = tuple(_field(item) for item in content["fields"])
         return Blueprint(**arguments)
@@ -245,7 +305,8 @@ def write_blueprint(folder: Path, blueprint: Blueprint) -> None:
     Raises:
         MachineError: The folder cannot be written.
     """
-    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "fingerprint": blueprint.fingerprint}
+    version = FORMAT_VERSION if blueprint.earlier else 1
+    document = {"format": FORMAT, "format_version": version, "fingerprint": blueprint.fingerprint}
     save_document(folder / PLAN, document | to_json(blueprint), work=folder / WORK)
 
 
@@ -257,7 +318,7 @@ def load_blueprint(folder: Path) -> Blueprint:
         MachineError: The system would not let us read it.
     """
     path = folder / PLAN
-    document = load_document(path, FORMAT, version=FORMAT_VERSION)
+    document = load_document(path, FORMAT, version=FORMAT_VERSION, form=FORM)
     blueprint = from_json(document)
     if blueprint.fingerprint != document.get("fingerprint"):
         raise DatasetError(f"{path} is damaged: its fingerprint does not match its content")

@@ -49,6 +49,8 @@ datasets.load_dataset("./FOLDER")
 ```
 """
 
+_BEFORE_NOTES, _AFTER_NOTES = ("split", "rows", "files"), "## How it was made"
+
 _VERIFY = """\
 ```text
 cnpgen validate . --deep
@@ -73,7 +75,7 @@ def card_text(summary: Summary, *, folder: str, notes: str = "") -> str:
         _front_matter(summary),
         f"# {blueprint.name} {blueprint.version}\n\n{blueprint.title or blueprint.name}\n\n{_contents(summary)}",
         notes.strip(),
-        f"## How it was made\n\n{_making(summary)}",
+        f"{_AFTER_NOTES}\n\n{_making(summary)}",
         f"## How to load it\n\n{_LOAD.replace('SPLIT', split).replace('FOLDER', folder)}",
         f"## Fields\n\n{_field_table(blueprint.fields)}",
         f"## Yield\n\n{_yield_table(summary)}",
@@ -81,6 +83,14 @@ def card_text(summary: Summary, *, folder: str, notes: str = "") -> str:
         f"## How to verify it\n\n{_VERIFY}",
     ]
     return "\n\n".join(section.strip() for section in sections if section) + "\n"
+
+
+def card_notes(card: str) -> str:
+    """Return the notes in a card that ``card_text`` wrote; nothing where there are none."""
+    _, _, rest = card.partition(f"| {' | '.join(_BEFORE_NOTES)} |\n")
+    _, _, rest = rest.partition("\n\n")  # the end of the table
+    notes, _, _ = f"\n\n{rest}".rpartition(f"\n\n{_AFTER_NOTES}\n")
+    return notes.strip()
 
 
 def _front_matter(summary: Summary) -> str:
@@ -104,7 +114,7 @@ def _contents(summary: Summary) -> str:
     proven = (
         "Every row passed every stage of its pipeline; the problem's constraints were evaluated on the stored numbers."
     )
-    return f"{proven}\n\n{_table(('split', 'rows', 'files'), rows)}"
+    return f"{proven}\n\n{_table(_BEFORE_NOTES, rows)}"
 
 
 def _making(summary: Summary) -> str:

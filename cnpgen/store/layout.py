@@ -2,7 +2,7 @@
 
 ```
 airhockey-replan-v1/
-  plan.json                 what will be made: written first, never changed
+  plan.json                 what will be made: written first, changed by an extension only
   train/shard-00000.h5      the rows
   train/shard-00000.json    the sidecar: that shard's commit record, written after it
   validation/...
@@ -24,7 +24,7 @@ WORK = "_work"
 DOCUMENTS = (PLAN, MANIFEST, STATS, CARD, CROISSANT)
 """The files of a dataset that are not of one shard."""
 
-SPLIT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+SPLIT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 """Names that are folders everywhere and splits to Hugging Face."""
 
 

@@ -48,7 +48,7 @@ def find_damaged(
     damaged = {}
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS))  # sha256 runs without Python's lock
     try:
-        for task, problem in zip(tasks, pool.map(partial(_problem, folder, blueprint.fingerprint), tasks), strict=True):
+        for task, problem in zip(tasks, pool.map(partial(_problem, folder, blueprint), tasks), strict=True):
             if problem:
                 damaged[task] = problem
             if progress is not None:
@@ -58,10 +58,10 @@ def find_damaged(
     return damaged
 
 
-def _problem(folder: Path, fingerprint: str, task: ShardTask) -> str:
+def _problem(folder: Path, blueprint: Blueprint, task: ShardTask) -> str:
     """Say what is wrong with a shard, or nothing."""
     try:
-        check_committed(folder, task, fingerprint)
+        check_committed(folder, task, blueprint.of(task).fingerprint)
     except DatasetError as error:
         return str(error)
     return ""

@@ -13,7 +13,7 @@ from cnpgen.errors import DatasetError, lacks
 from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, PLAN
-from cnpgen.store.manifest import load_manifest
+from cnpgen.store.manifest import lists_shards_of, load_manifest
 from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard, storage_dtype
@@ -46,7 +46,7 @@ class StoredDataset:
             raise DatasetError(f"{self.folder} {lacks('split', split, self.blueprint.splits)}")
         found = [task for task in shards(self.blueprint) if task.split == split]
         if self.manifest is None:
-            return [task for task in found if is_committed(self.folder, task, self.blueprint.fingerprint)]
+            return [task for task in found if is_committed(self.folder, task, self.blueprint.of(task).fingerprint)]
         return found
 
     def iter_shards(
@@ -154,6 +154,8 @@ def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> Store
             raise DatasetError(
                 f"{folder / MANIFEST} is of another blueprint than {PLAN}: the folder mixes two datasets"
             )
+        if not lists_shards_of(manifest, blueprint):
+            raise DatasetError(f"{folder / MANIFEST} lists other shards than {PLAN}")
         return StoredDataset(folder, blueprint, manifest)
     if not allow_incomplete:
         raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_incomplete=True))}")

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, shard_attributes, shards
-from cnpgen.store.fates import Fates, fates_from_json
+from cnpgen.store.fates import FATES_FORM, Fates, fates_from_json
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import load_document, save_document
+from cnpgen.store.files.forms import EVERY, NUMBER, TEXT, WHOLE, check_form
 from cnpgen.store.layout import WORK
 from cnpgen.store.shard import write_shard
-from cnpgen.store.statistics import FieldStatistics, column_statistics, statistics_from_json
+from cnpgen.store.statistics import STATISTICS_FORM, FieldStatistics, column_statistics, statistics_from_json
 
 FORMAT = "cnpgen-shard-record"
 FORMAT_VERSION = 1
@@ -51,6 +52,14 @@ class ShardRecord:
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
+FORM = {
+    **dict.fromkeys(("file", "sha256", "plan_fingerprint", "started"), TEXT),
+    **dict.fromkeys(("bytes", "rows", "first_sample_id"), WHOLE),
+    "seconds": NUMBER,
+    "versions": {EVERY: TEXT},
+    "outcome": FATES_FORM,
+    "statistics": {EVERY: STATISTICS_FORM},
+}
 _PLAIN = ("file", "bytes", "sha256", "rows", "first_sample_id", "plan_fingerprint", "started", "seconds", "versions")
 
 
@@ -70,11 +79,12 @@ def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
         DatasetError: A key is missing or has the wrong type.
     """
     try:
+        check_form(content, FORM)
         statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
         fates = fates_from_json(content["outcome"])
         return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, fates=fates)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(f"the shard's record is damaged: {type(error).__name__} {error}") from error
+    except ValueError as error:
+        raise DatasetError(f"the shard's record is damaged: {error}") from error
 
 
 def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
@@ -95,7 +105,7 @@ def load_record(folder: Path, task: ShardTask) -> ShardRecord:
         MachineError: The system would not let us read it.
     """
     path = folder / task.sidecar
-    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION))
+    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION, form=FORM))
     found = (record.file, record.rows, record.first_sample_id)
     if found != (task.file, task.rows, task.first_row):
         raise DatasetError(f"{path} is the record of another shard: {found[0]}, {found[1]} rows from row {found[2]}")
@@ -132,14 +142,15 @@ def commit_shard(
         DatasetError: The columns are not what the blueprint says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    if is_committed(folder, task, blueprint.fingerprint):  # by somebody to whom the same work was given
+    fingerprint = blueprint.of(task).fingerprint
+    if is_committed(folder, task, fingerprint):  # by somebody to whom the same work was given
         return load_record(folder, task)
     about = {"fates": fates, "started": started, "seconds": seconds, "versions": versions or {}}
     try:
         return _write(folder, blueprint, task, columns, about)
     except CnpgenError:
         # somebody may have committed it meanwhile, finished the dataset and swept our temporary file away with theirs
-        if is_committed(folder, task, blueprint.fingerprint):
+        if is_committed(folder, task, fingerprint):
             return load_record(folder, task)
         raise
 
@@ -152,7 +163,7 @@ def _write(
     about: Mapping[str, Any],
 ) -> ShardRecord:
     """Write a shard and then its sidecar, which says how the shard came about, unless somebody else has meanwhile."""
-    path = folder / task.file
+    path, fingerprint = folder / task.file, blueprint.of(task).fingerprint
     size = write_shard(
         path, columns, blueprint.fields, shard_attributes(blueprint, task), dtype=blueprint.dtype, work=folder / WORK
     )
@@ -162,11 +173,11 @@ def _write(
         sha256=file_sha256(path),
         rows=task.rows,
         first_sample_id=task.first_row,
-        plan_fingerprint=blueprint.fingerprint,
+        plan_fingerprint=fingerprint,
         statistics=column_statistics(columns, blueprint.fields),
         **about,
     )
-    if is_committed(folder, task, blueprint.fingerprint):  # meanwhile, by somebody who may have summed up their record
+    if is_committed(folder, task, fingerprint):  # meanwhile, by somebody who may have summed up their record
         return load_record(folder, task)
     save_record(folder, task, record)
     return record
@@ -224,4 +235,4 @@ def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
 
 def pending(folder: Path, blueprint: Blueprint) -> list[ShardTask]:
     """List the shards that are still to be made, in order."""
-    return [task for task in shards(blueprint) if not is_committed(folder, task, blueprint.fingerprint)]
+    return [task for task in shards(blueprint) if not is_committed(folder, task, blueprint.of(task).fingerprint)]

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store.blueprint import INFORMATIONAL, Blueprint, load_blueprint, to_json, write_blueprint
-from cnpgen.store.files.atomic import machine_error, read_file, sweep
+from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import Difference, differences
+from cnpgen.store.files.leftovers import sweep
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
@@ -69,6 +70,8 @@ def find_workspace(folder: Path) -> Workspace:
 def check_place(workspace: Workspace) -> None:
     """Refuse a folder in which no dataset can be made, before any work is done for it.
 
+    A finished dataset need not be writable: it may turn out that there is nothing to do.
+
     Raises:
         UsageError: It is a file, lies below one, or holds something that is not a dataset of cnpgen.
         MachineError: It cannot be written.
@@ -77,8 +80,16 @@ def check_place(workspace: Workspace) -> None:
         raise UsageError(f"{workspace.there} is a file, not a folder; choose another out=")
     if workspace.holds == "something else":
         raise UsageError(f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another out=")
+    if (workspace.folder / MANIFEST).is_file():
+        return
     if not os.access(workspace.there, os.W_OK | os.X_OK):
-        raise machine_error("write to", workspace.folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+        number = errno.EROFS if _is_read_only(workspace.there) else errno.EACCES
+        raise machine_error("write to", workspace.folder, OSError(number, os.strerror(number)))
+
+
+def _is_read_only(path: Path) -> bool:
+    """Whether a path is on a file system that nobody can write to."""
+    return hasattr(os, "statvfs") and bool(os.statvfs(path).f_flag & os.ST_RDONLY)
 
 
 def begun_blueprint(workspace: Workspace, wanted: Blueprint) -> Blueprint | None:
@@ -139,12 +150,16 @@ def require_blueprint(folder: Path, blueprint: Blueprint) -> None:
     """Make sure that the folder still belongs to a blueprint: another process may have replaced the dataset meanwhile.
 
     Raises:
-        UsageError: It has another blueprint now, or none.
+        UsageError: It has another blueprint now.
+        MachineError: It has none, or is gone.
     """
     try:
         mine = blueprint.fingerprint.encode() in read_file(folder / PLAN)
-    except DatasetError:
-        mine = False
+    except DatasetError as error:
+        what = f"the {PLAN} in it" if folder.is_dir() else "it"
+        raise MachineError(
+            f"{folder}: {what} was deleted or moved while the dataset was made; make it again"
+        ) from error
     if not mine:
         raise UsageError(f"{folder} was given to another dataset while this one was made; choose another out=")
 
@@ -170,15 +185,21 @@ def _shard_files(folder: Path) -> Iterator[Path]:
 
 def _refusal(found: Blueprint, wanted: Blueprint) -> str:
     """Say why a dataset cannot become another one, and what to do."""
-    same = (*INFORMATIONAL, "splits")
+    if changed := changed_settings(found, wanted):
+        return f"holds another dataset ({changed}); choose another out=, or replace it with force=True"
+    larger = all(rows <= wanted.splits.get(split, 0) for split, rows in found.splits.items())
+    extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if larger else ""
+    return (
+        f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; the rows that both sizes have are the"
+        f" same: {extend}choose another out=, or replace it with force=True"
+    )
+
+
+def changed_settings(found: Blueprint, wanted: Blueprint) -> str:
+    """Name up to three settings in which two blueprints differ, except for their sizes; nothing if there are none."""
+    same = (*INFORMATIONAL, "splits", "earlier")
     old, new = ({key: value for key, value in to_json(item).items() if key not in same} for item in (found, wanted))
-    changed = dict.fromkeys(_setting(difference) for difference in differences(old, new))
-    if not changed:
-        return (
-            f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; a dataset does not grow or shrink,"
-            " but the rows that both sizes have are the same: choose another out=, or replace it with force=True"
-        )
-    return f"holds another dataset ({'; '.join([*changed][:3])}); choose another out=, or replace it with force=True"
+    return "; ".join([*dict.fromkeys(_setting(difference) for difference in differences(old, new))][:3])
 
 
 def _setting(difference: Difference) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import committing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,10 +43,8 @@ def plot_curve(log: str, path: str | Path) -> None:
         axis.set_xlabel("CPU time of training [s]")
     for axis in axes:
         axis.grid(alpha=0.3)
-    try:
-        figure.savefig(Path(path))
-    except OSError as error:
-        raise machine_error("write", Path(path), error) from error
+    with committing(Path(path)) as temporary:
+        figure.savefig(temporary, format=Path(path).suffix.removeprefix("."))
 
 
 def _draw_loss(axis: "Axes", steps: list[dict[str, Any]]) -> None:

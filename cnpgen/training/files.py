@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cnpgen.errors import UsageError
-from cnpgen.store.files.atomic import sweep_dead
+from cnpgen.store.files.leftovers import sweep_file
 from cnpgen.training.log import is_log
 
 CHECKPOINT, LOG, PICTURE = ".checkpoint", ".jsonl", ".png"  # in place of .h5
@@ -35,4 +35,4 @@ def check_beside(out: Path) -> None:
 def sweep_beside(out: Path) -> None:
     """Remove what killed runs have left of the files that they were writing."""
     for path in (out, *(out.with_suffix(suffix) for suffix in (CHECKPOINT, LOG))):
-        sweep_dead(path)
+        sweep_file(path)

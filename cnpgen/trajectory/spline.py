@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+HUGE = 1e150  # control points beyond it are scaled before their products, which would be infinite, are taken
+
 
 def clamped_knots(points: int, degree: int) -> Array:
     """Return the knot vector of the paper's Appendix A, shape (points + degree + 1,)."""
@@ -138,10 +140,11 @@ def extremes(control: Array, degree: int) -> tuple[Array, Array]:
     """Return where on [0, 1] one spline of finite control points, shape (C,), ends or turns, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
-    spline = BSpline(clamped_knots(len(control), degree), control, degree)
+    scale = 2.0**-600 if np.abs(control).max() > HUGE else 1.0  # a power of two, which changes no digit
+    spline = BSpline(clamped_knots(len(control), degree), control * scale, degree)
     turning = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
     s = np.clip(np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]]), 0, 1)
-    return s, np.asarray(spline(s))
+    return s, np.asarray(spline(s)) / scale
 
 
 @dataclass(frozen=True)

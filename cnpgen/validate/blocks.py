@@ -9,12 +9,12 @@ import numpy as np
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
+from cnpgen.make.load import restored
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.make.shards import Job, blocks_of, prepare, shard_columns
 from cnpgen.store.blueprint import REVISION, Blueprint, ShardTask
 from cnpgen.store.check import Finding
 from cnpgen.store.reader import StoredDataset
-from cnpgen.validate.documents import restored
 
 PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
 PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32

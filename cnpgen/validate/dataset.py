@@ -7,7 +7,8 @@ from typing import Any
 
 from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.report import RowReport
-from cnpgen.machine.workers import worker_count
+from cnpgen.machine.engine import Engine
+from cnpgen.make.load import restored
 from cnpgen.schema.arguments import integer
 from cnpgen.store.blueprint import Blueprint, load_blueprint, shards
 from cnpgen.store.check import Finding, check_dataset
@@ -16,7 +17,7 @@ from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed
 from cnpgen.store.workspace import is_dataset
 from cnpgen.validate.blocks import Regeneration, backend_of, make_again
-from cnpgen.validate.documents import check_recipe, check_statistics, restored
+from cnpgen.validate.documents import check_recipe, check_statistics
 from cnpgen.validate.rows import DeepCheck, check_rows
 
 
@@ -100,6 +101,8 @@ def validate_dataset(
     deep: bool = False,
     regenerate: int = 0,
     workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> ValidationReport:
     """Check a dataset.
@@ -112,6 +115,8 @@ def validate_dataset(
             Coal.
         regenerate: How many random blocks to make again and compare.
         workers: Processes for the deep check; default one per available core.
+        engine: Where they run, as of ``make_dataset``.
+        address: Likewise.
         progress: Called with the rows of every shard that was recomputed.
 
     Raises:
@@ -123,6 +128,7 @@ def validate_dataset(
             made again.
     """
     folder, regenerate = Path(folder), integer("regenerate", regenerate, least=0)
+    where = Engine(engine, address, workers)
     require_folder(folder)
     if not is_dataset(folder):
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
@@ -132,11 +138,11 @@ def validate_dataset(
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
     _require_means(folder, blueprint, deep=deep, regenerate=regenerate)
-    present = [task for task in shards(blueprint) if is_committed(folder, task, blueprint.fingerprint)]
+    present = [task for task in shards(blueprint) if is_committed(folder, task, blueprint.of(task).fingerprint)]
     wrong = {finding.file for finding in findings if not finding.note}
     whole = [task for task in present if task.file not in wrong]
     findings += check_recipe(blueprint) + (check_statistics(folder, blueprint) if deep else [])
-    checked = check_rows(folder, blueprint, whole, worker_count(workers, len(whole)), progress) if deep else DeepCheck()
+    checked = check_rows(folder, blueprint, whole, where, progress) if deep else DeepCheck()
     again = make_again(folder, blueprint, whole, regenerate) if regenerate else Regeneration()
     return ValidationReport(
         folder,

@@ -1,19 +1,15 @@
 """What the documents of a dataset say together: the recipe in its blueprint, and whether the statistics add up."""
 
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.make.load import restore_dataset_recipe
-from cnpgen.make.recipe import DatasetRecipe, resolved_digest
+from cnpgen.make.recipe import resolved_digest
 from cnpgen.store.blueprint import Blueprint
 from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.files.documents import load_document, plain
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import PLAN, STATS
-from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
+from cnpgen.store.summary import STATS_FORM, STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
 
 
 def check_recipe(blueprint: Blueprint) -> list[Finding]:
@@ -32,7 +28,7 @@ def check_recipe(blueprint: Blueprint) -> list[Finding]:
 def check_statistics(folder: Path, blueprint: Blueprint) -> list[Finding]:
     """Check that ``stats.json`` sums up the records of the shards, all of which must be there."""
     try:
-        document = load_document(folder / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+        document = load_document(folder / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION, form=STATS_FORM)
         expected = plain(stats_document(summarise(folder, blueprint)))
     except DatasetError:  # missing or damaged: found already
         return []
@@ -41,15 +37,3 @@ def check_statistics(folder: Path, blueprint: Blueprint) -> list[Finding]:
         return []
     advice = f"delete {STATS} and {AGAIN}: it writes the file anew"
     return [Finding(STATS, f"does not sum up the shards' records: {', '.join(wrong)} differ", advice=advice)]
-
-
-@contextmanager
-def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
-    """Rebuild the recipe from a blueprint, its URDF in a temporary folder that is gone when the block ends.
-
-    Raises:
-        RecipeError: It does not fit this version of cnpgen.
-        PluginError: It needs packages that are not installed.
-    """
-    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-        yield restore_dataset_recipe(dict(blueprint.recipe), str(blueprint.robot["urdf"]), Path(folder))

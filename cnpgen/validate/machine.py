@@ -80,6 +80,7 @@ class MachineReport:
         backend_reason: Why.
         cache_folder: Where kernels are cached.
         cache_writable: Whether they can be.
+        cache_used: Whether those that are there are loaded: only if nobody else may change them.
         recipes: How many recipes were found where.
         free_bytes: Free disk space in the working directory; 0 where it is gone.
         problems: What keeps cnpgen from working, each with its remedy.
@@ -101,6 +102,7 @@ class MachineReport:
     backend_reason: str
     cache_folder: str
     cache_writable: bool
+    cache_used: bool
     recipes: str
     free_bytes: int
     problems: tuple[str, ...]
@@ -124,6 +126,7 @@ def check_machine() -> MachineReport:
     theirs = users_environment()
     cache = _or(_cache_folder, "")
     backend, reason, writable = _check_backend(found, cache)
+    cache_used = _check_cache(found, cache)
     return MachineReport(
         cnpgen=_version_of("cnpgen"),
         python=platform.python_version(),
@@ -140,6 +143,7 @@ def check_machine() -> MachineReport:
         backend_reason=reason,
         cache_folder=cache,
         cache_writable=writable,
+        cache_used=cache_used,
         recipes=_check_recipes(found),
         free_bytes=_check_disk(found),
         problems=tuple(found.problems),
@@ -263,6 +267,20 @@ def _check_backend(found: _Findings, cache: str) -> tuple[str, str, bool]:
         "a test kernel was compiled and computes what it should" if backend == "compiled" else "no C compiler works"
     )
     return backend, reason, str(folder) == cache
+
+
+def _check_cache(found: _Findings, cache: str) -> bool:
+    """Return whether the kernels in the cache may be loaded, and note those that may not."""
+    from cnpgen.kernels.cache import distrusted, distrusted_files
+
+    if not cache or not Path(cache).is_dir() or distrusted(Path(cache)):  # the choice of a backend has said why
+        return False
+    if files := distrusted_files(Path(cache)):
+        found.notes.append(
+            f"kernels in the cache that others may have changed are not used ({len(files)}): delete them, the first one"
+            f" is {files[0]}"
+        )
+    return True
 
 
 def _check_recipes(found: _Findings) -> str:

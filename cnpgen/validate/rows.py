@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, counted
+from cnpgen.judges.rows.hits import HitRule, hit_rule, repeated_share, shares_of
 from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
-from cnpgen.machine.workers import share_out
+from cnpgen.machine.engine import Engine, assembled
+from cnpgen.make.load import restored
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.check import DELETE, Finding
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import read_shard
-from cnpgen.validate.documents import restored
 from cnpgen.validate.numbers import check_numbers
 
 _ODD = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
@@ -44,7 +45,7 @@ class DeepCheck:
 
 
 def check_rows(
-    folder: Path, blueprint: Blueprint, tasks: list[ShardTask], workers: int, progress: Callable[[int], None] | None
+    folder: Path, blueprint: Blueprint, tasks: list[ShardTask], engine: Engine, progress: Callable[[int], None] | None
 ) -> DeepCheck:
     """Recompute every row, shard by shard, and judge every plan.
 
@@ -52,20 +53,23 @@ def check_rows(
         folder: The dataset.
         blueprint: Its blueprint.
         tasks: The shards to read.
-        workers: Processes.
+        engine: Where the work is shared out to.
         progress: Called with the rows of every shard that was read.
     """
     checks, findings = [], []
-    with closing(share_out(partial(_verify_shard, folder, blueprint), tasks, workers, ordered=True)) as results:
-        for task, result in zip(tasks, results, strict=True):
-            findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
-            checks.append(result)
-            if progress is not None:
-                progress(task.rows)
+    with assembled(engine, len(tasks)) as team:
+        verify = partial(_verify_shard, folder.absolute() if team.is_far else folder, blueprint)
+        with closing(team.share_out(verify, tasks, ordered=True)) as results:
+            for task, result in zip(tasks, results, strict=True):
+                findings += [Finding(task.file, problem, advice=DELETE) for problem in result.problems]
+                checks.append(result)
+                if progress is not None:
+                    progress(task.rows)
     every = np.concatenate([np.empty(0, np.uint64), *(check.keys for check in checks)])
     twice = len(every) - len(np.unique(every))
     if twice:
         findings.append(Finding("(all splits)", f"{counted(twice, 'row')} that stand in the dataset before, too"))
+    findings += [Finding("(all splits)", text) for text in _slowed_down(blueprint, checks)]
     reports = [check.report for check in checks if check.report is not None]
     judged, valid = (sum(getattr(check.plans, what) for check in checks) for what in ("judged", "valid"))
     return DeepCheck(merge(reports) if reports else None, judged, valid, tuple(findings))
@@ -80,12 +84,14 @@ class _ShardCheck:
         problems: What is wrong with it.
         keys: A hash of the boundary states of every row, shape (rows,).
         plans: What the verdict says of its plans.
+        shares: Which fraction of the highest possible speed its hits have, shape (rows,); none if they are no hits.
     """
 
     report: RowReport | None
     problems: list[str]
     keys: NDArray[np.uint64]
     plans: PlanCheck
+    shares: NDArray[np.float64]
 
 
 def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _ShardCheck:
@@ -94,11 +100,11 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
         columns = read_shard(folder / task.file)
         record = load_record(folder, task)
     except CnpgenError as error:
-        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck())
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0))
     with restored(blueprint) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
-        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype)
+        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype, rule=_rule(blueprint))
         plans = check_plans(problem, robot, columns)
     problems = [*plans.problems, *check_numbers(blueprint, task, columns, record)]
     problems += [
@@ -107,7 +113,23 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
         for check in report.failed
     ]
     ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
-    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans)
+    shares = shares_of(columns) if {"hit_speed", "hit_speed_max"} <= columns.keys() else np.empty(0)
+    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, shares)
+
+
+def _rule(blueprint: Blueprint) -> HitRule:
+    """Return what the recorded stages say of the goals of hits."""
+    return hit_rule(blueprint.recipe["pipeline"]["stage"])
+
+
+def _slowed_down(blueprint: Blueprint, checks: list[_ShardCheck]) -> list[str]:
+    """Say that more hits have the same fraction of their highest speed than luck gives them."""
+    shares = np.concatenate([np.empty(0), *(check.shares for check in checks)])
+    if _rule(blueprint).full_speed is None:
+        return []
+    count, share = repeated_share(shares, blueprint.dtype)
+    same = f"{counted(count, 'hit')} with the same fraction of their highest speed, {share:.6g}"
+    return [f"{same}, which is drawn for each: they were slowed down afterwards"] if count else []
 
 
 def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:

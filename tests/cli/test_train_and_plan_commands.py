@@ -63,6 +63,20 @@ def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tm
     assert training["dataset"]["rows"] == {"train": 600, "validation": 60}
 
 
+def test_a_run_that_was_killed_before_its_picture_was_drawn_draws_it_when_it_is_started_again(
+    tiny, tmp_path, capsys, monkeypatch
+):
+    path, command = tmp_path / "hits.h5", ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "hits.h5"), *SMALL]
+    with monkeypatch.context() as patch:
+        patch.setattr("cnpgen.cli.train_command._draw", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert main(command) == 130
+    before = path.read_bytes()
+    assert not path.with_suffix(".png").exists()
+    assert main(command) == 0
+    assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert path.read_bytes() == before
+
+
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("often", [0, 100])
 def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):

@@ -5,6 +5,7 @@ import math
 import platform
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +26,8 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.mapped import MappedKernel
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
-from tests.conftest import Prepare, needs_compiler
+from tests.conftest import HANGING, Prepare, needs_compiler
+from tests.machine.test_workers import alive
 
 Array = np.ndarray
 
@@ -614,6 +616,24 @@ BROKEN = {
     "is not quoted right": ("CC", "cc '-O2", "no C compiler found: CC is"),
     "is not installed": ("PATH", "", "no C compiler found"),
 }
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_a_compiler_that_hangs_is_ended_with_all_that_it_has_started(own_cache, monkeypatch, tmp_path):
+    hanging = tmp_path / "cc"
+    hanging.write_text(f"#!/bin/sh\nsleep 1000 &\necho $! > {tmp_path}/child\nwait\n")
+    hanging.chmod(0o755)
+    monkeypatch.setenv("CC", str(hanging))
+    monkeypatch.setattr(compiled_module, "VERSION_SECONDS", 0.5)
+    begun = time.monotonic()
+    with pytest.raises(MachineError, match=r"cc took more than 0\.5 s to say its version"):
+        choose_backend("compiled")
+    assert time.monotonic() - begun < HANGING / 10
+    child = int((tmp_path / "child").read_text())
+    deadline = time.monotonic() + HANGING
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not alive(child)
 
 
 @needs_compiler

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from functools import partial
@@ -12,8 +13,8 @@ from pathlib import Path
 import joblib
 import pytest
 
-from cnpgen.errors import MachineError, UsageError
-from cnpgen.machine.workers import _signals_held, share_out, worker_count
+from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.machine.workers import share_out, signals_held, worker_count
 from tests.conftest import HANGING
 from tests.examples.tiny_datasets import digests, make_tiny
 
@@ -67,14 +68,74 @@ if __name__ == "__main__":
 """
 
 
+KILLED_WHILE_SENDING = """
+import os, signal, sys
+from multiprocessing.connection import Connection
+from cnpgen.errors import DatasetError
+from cnpgen.machine.workers import share_out
+
+whole = Connection._send
+
+def half(self, content, write=os.write):  # what a pipe takes as a whole is written as a whole
+    if len(content) <= 4096:
+        return whole(self, content)
+    os.write(self._handle, content[:4096])
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def long(task):
+    Connection._send = half
+    if task == 3:
+        raise DatasetError("x" * 100_000)
+    return bytes(100_000)
+
+if __name__ == "__main__":
+    found = []
+    try:
+        for each in share_out(long, range(4), 2, ordered=True):
+            found.append(len(each))
+    except DatasetError as error:
+        print(found, len(str(error)))
+"""
+
+
 @linux
-def test_what_a_killed_process_leaves_is_tidied_up_without_a_word():
+def test_a_worker_that_is_killed_while_it_sends_a_long_result_keeps_nobody_waiting():
+    """It never does: what is long goes through a file. Else the parent would wait for the other half for ever."""
+    command = [sys.executable, "-c", KILLED_WHILE_SENDING]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGING, check=False)
+    assert (done.returncode, done.stdout) == (0, "[100000, 100000, 100000] 100000\n"), done.stderr
+
+
+def long_or_short(size: int) -> bytes:
+    if size < 0:
+        raise DatasetError("x" * -size)
+    return bytes(size)
+
+
+def test_results_of_any_length_come_back_and_leave_no_file_behind(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    sizes = [0, 1000, 2000, 2040, 2048, 2100, 4096, 16_384, 70_000, 3_000_000]
+    assert list(map(len, share_out(long_or_short, sizes, 2, ordered=True))) == sizes
+    for size in (10, 100_000):
+        with pytest.raises(DatasetError) as caught:
+            list(share_out(long_or_short, [5, -size, 7], 2))
+        assert str(caught.value) == "x" * size
+        assert "in long_or_short" in caught.value.__notes__[0]
+    assert not list(tmp_path.iterdir())
+
+
+@linux
+def test_what_a_killed_process_leaves_is_tidied_up_without_a_word(tmp_path):
     options, pipe = list(sys.warnoptions), subprocess.PIPE
     command = [sys.executable, "-c", KILLED]
-    with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True
+    ) as process:
         said = process.communicate("go on\ndie\n", timeout=HANGING)  # until the helpers are gone, too
     assert (process.returncode, *said) == (-signal.SIGKILL, "", "")
     assert not [path for path in Path("/dev/shm").iterdir() if f"loky-{process.pid}-" in path.name]
+    assert not list(tmp_path.iterdir())
     assert sys.warnoptions == options
 
 
@@ -114,7 +175,7 @@ def test_a_signal_that_comes_while_workers_start_is_only_delayed():
     started, over = [], threading.Event()
 
     def interrupted() -> None:
-        with _signals_held():
+        with signals_held():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
             started.append(True)
@@ -173,18 +234,26 @@ def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, n
 # --- other backends ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ["threading", "sequential"])
-def test_backends_without_processes_make_the_same_bytes(tiny, tmp_path, backend):
+@pytest.mark.parametrize("backend", ["threading", "sequential", "multiprocessing"])
+def test_other_backends_make_the_same_bytes(tiny, tmp_path, backend):
     with joblib.parallel_config(backend=backend):
         make_tiny(tmp_path / "out", workers=4, shard_size=250)
     assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
 
 
-def test_a_backend_that_cannot_yield_results_is_refused_before_anything_is_made(tmp_path):
-    match = "MultiprocessingBackend cannot yield results one by one: choose loky"
-    with joblib.parallel_config(backend="multiprocessing"), pytest.raises(UsageError, match=match):
-        make_tiny(tmp_path / "out", workers=2)
-    assert not digests(tmp_path / "out")
+def test_a_backend_that_knows_only_lists_is_given_a_few_tasks_at_a_time():
+    fetched = []
+
+    def tasks():
+        for number in range(1000):
+            fetched.append(number)
+            yield number
+
+    with joblib.parallel_config(backend="multiprocessing"):
+        results = share_out(abs, tasks(), 2)
+        assert [next(results) for _ in range(20)] == list(range(20))
+        results.close()
+    assert len(fetched) < 50
 
 
 @pytest.fixture

@@ -3,13 +3,17 @@
 import errno
 import os
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
 from cnpgen.make.dataset import make_dataset
@@ -75,7 +79,8 @@ def test_another_size_is_refused_with_what_can_be_done(folder, rows):
     text = str(caught.value)
     assert "holds this dataset with 660 rows (train 600, validation 60), not with" in text
     assert f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
-    assert "the rows that both sizes have are the same: choose another out=, or replace it with force=True" in text
+    extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if rows > 660 else ""
+    assert f"have are the same: {extend}choose another out=, or replace it with force=True" in text
     assert snapshot(folder) == before
 
 
@@ -263,6 +268,71 @@ def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path,
     assert code == 3
     assert line.endswith("new: Permission denied; choose a folder that you may write to")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Callable[..., None]]:
+    """A file system of its own in ``tmp_path / "disk"``, which can be mounted again in another way."""
+    (tmp_path / "disk").mkdir()
+
+    def mount(*options: str) -> None:
+        command = ["mount", "-t", "tmpfs", "-o", ",".join(["size=8m", *options]), "tmpfs", str(tmp_path / "disk")]
+        if shutil.which("mount") is None or subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("this user cannot mount a file system")
+
+    mount()
+    yield mount
+    subprocess.run(["umount", str(tmp_path / "disk")], check=True)
+
+
+def test_a_finished_dataset_on_read_only_storage_is_left_as_it_is(tmp_path, disk, capsys):
+    out = str(tmp_path / "disk" / "out")
+    command = ["make-dataset", "airhockey-hit", "--n", "100", "--workers", "1", "--out", out]
+    assert main(command) == 0
+    disk("remount", "ro")
+    before = snapshot(Path(out))
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "already complete" in capsys.readouterr().err
+    for other in (out + "2", str(tmp_path / "disk" / "a" / "b")):
+        code, line = refused(capsys, other)
+        assert code == 3
+        assert line == f"cnpgen: error: cannot write to {other}: Read-only file system; choose another folder"
+    assert snapshot(Path(out)) == before
+
+
+def test_a_read_only_file_system_is_named_as_that(tmp_path, capsys, monkeypatch):
+    """Where nobody can mount one, as the test above does."""
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)
+    monkeypatch.setattr(os, "statvfs", lambda _path: SimpleNamespace(f_flag=os.ST_RDONLY))
+    code, line = refused(capsys, str(tmp_path / "new"))
+    assert code == 3
+    assert "Read-only file system" in line
+
+
+def test_a_folder_that_is_deleted_while_the_dataset_is_made_is_said_to_be_that(tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(
+        MachineError, match=rf"^{out}: it was deleted or moved while the dataset was made; make it again$"
+    ):
+        make_tiny(out, progress=lambda *_: shutil.rmtree(out))
+    assert not out.exists()
+    with pytest.raises(MachineError, match=r": the plan\.json in it was deleted or moved"):
+        make_tiny(out, progress=lambda *_: (out / "plan.json").unlink())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are Unicode here")
+def test_a_folder_whose_name_is_not_utf_8_is_like_any_other(tiny, tmp_path):
+    out = tmp_path / os.fsdecode(b"d\xff")
+    assert make_tiny(out).complete
+    assert digests(out) == digests(tiny("airhockey-hit"))
+    assert validate_dataset(out, deep=True).ok
+    assert make_tiny(out).made == 0
+    assert 'load_dataset("./d\ufffd")' in (out / "README.md").read_text(encoding="utf-8")
+    command = [sys.executable, "-m", "cnpgen", "make-dataset", "airhockey-hit", "--n", "50", "-o", "e\udcff"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (0, b"e\\udcff\n"), done.stderr
+    assert cnpgen.load_dataset(tmp_path / os.fsdecode(b"e\xff")).arrays("train")
 
 
 WRONG = {

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.store.files.atomic import committing, file_sha256, read_file, sweep, write_file
+from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_file
 
 
 def failing(code: int) -> Callable[..., None]:
@@ -116,16 +116,3 @@ def test_a_missing_file_is_a_dataset_error_and_an_unreadable_one_a_machine_error
         read(tmp_path / "nothing")
     with pytest.raises(MachineError, match="cannot read"):
         read(tmp_path)
-
-
-def test_sweeping_removes_old_temporary_files_and_keeps_others(tmp_path: Path) -> None:
-    work = tmp_path / "_work"
-    sweep(work)
-    work.mkdir()
-    for name in (".old.1.2.tmp", ".new.1.2.tmp", "log.txt"):
-        (work / name).write_text("")
-    os.utime(work / ".old.1.2.tmp", (0, 0))
-    sweep(work)
-    assert sorted(path.name for path in work.iterdir()) == [".new.1.2.tmp", "log.txt"]
-    sweep(work, older_than=0.0)
-    assert [path.name for path in work.iterdir()] == ["log.txt"]

@@ -158,7 +158,7 @@ def test_missing_newer_and_nonsensical_blueprints_are_refused(tmp_path: Path) ->
     with pytest.raises(DatasetError, match="missing"):
         load_blueprint(tmp_path)
     path = tmp_path / "plan.json"
-    save_document(path, {"format": "cnpgen-plan", "format_version": 2})
+    save_document(path, {"format": "cnpgen-plan", "format_version": 3})
     with pytest.raises(DatasetError, match="upgrade"):
         load_blueprint(tmp_path)
     document = {"format": "cnpgen-plan", "format_version": 1, "fingerprint": BLUEPRINT.fingerprint}

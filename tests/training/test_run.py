@@ -20,6 +20,7 @@ from cnpgen.losses.metric_settings import BOUNDED
 from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
+from cnpgen.store.files.leftovers import temporary_name
 from cnpgen.training import checkpoint as checkpoints
 from cnpgen.training.train import Trained, train_model
 from tests.conftest import tiny_recipe
@@ -292,8 +293,12 @@ def test_the_log_and_the_picture_of_a_run_are_replaced_by_those_of_the_next_one(
 def test_what_killed_runs_were_writing_is_removed_and_nothing_else(train, tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as gone:
         gone.wait()
-    mine = [f".model.{end}.{gone.pid}.{'0' * 32}.tmp" for end in ("h5", "checkpoint", "jsonl")]
-    others = [f".model.h5.{os.getppid()}.{'0' * 32}.tmp", f".other.h5.{gone.pid}.{'0' * 32}.tmp", ".model.h5.tmp"]
+
+    def of(name: str, process: int) -> str:
+        return temporary_name(name).replace(f"-{os.getpid()}.", f"-{process}.")
+
+    mine = [of(f"model.{end}", gone.pid) for end in ("h5", "checkpoint", "jsonl")]
+    others = [of("model.h5", os.getppid()), of("other.h5", gone.pid), ".model.h5.tmp"]
     for name in (*mine, *others):
         (tmp_path / name).write_bytes(b"half")
     train()

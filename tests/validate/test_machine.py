@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from cnpgen.cli.doctor_command import machine_text
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.machine import threads
 from cnpgen.validate import machine
@@ -129,8 +130,26 @@ def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(monkeypatch, t
     report = check_machine()
     assert report.ok
     assert not report.cache_writable
+    assert not report.cache_used
     assert any("CNPGEN_CACHE" in note for note in report.notes)
     assert list((tmp_path / "tmp").iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="files have no owners here")
+def test_a_cache_or_a_kernel_that_others_may_write_to_is_a_note(monkeypatch, tmp_path):
+    (tmp_path / "cache" / "lib").mkdir(0o700, parents=True)
+    (tmp_path / "cache").chmod(0o777)
+    monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
+    report = check_machine()
+    assert not report.cache_used
+    assert any(f"others may write to {tmp_path / 'cache'}" in note for note in report.notes)
+    assert f"{tmp_path / 'cache'} (not used)" in " ".join(machine_text(report).split())
+    (tmp_path / "cache").chmod(0o700)
+    (planted := tmp_path / "cache" / "lib" / "ik-123.so").write_bytes(b"")
+    planted.chmod(0o666)
+    report = check_machine()
+    assert report.cache_used
+    assert any("are not used (1)" in note and str(planted) in note for note in report.notes)
 
 
 def test_a_container_with_fewer_cores_is_a_note(monkeypatch):

@@ -17,8 +17,6 @@ from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
-from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
@@ -162,8 +160,8 @@ def name_part(problem: Problem, constraint: Constraint, condition: Condition, pa
         return ""
     if isinstance(constraint, _PER_JOINT):
         return problem.robot.joints[part]
-    if isinstance(constraint, Table | Vertical):
-        return "xy"[part]
+    if condition.parts:
+        return condition.parts[part]
     obstacles = [obstacle.name for obstacle in problem.obstacle]
     if isinstance(constraint, ObjectContact):
         return obstacles[part]

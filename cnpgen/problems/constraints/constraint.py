@@ -48,6 +48,7 @@ class Condition:
         lower: Lower bounds, shape (m,), -inf where there is none.
         upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
         exactness: Key of ``EXACTNESS``: how exactly a boundary state must meet it.
+        parts: Names of the values, m of them, or none: they are numbered then.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Condition:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exactness: str
+    parts: tuple[str, ...] = ()
 
     @property
     def is_equality(self) -> bool:

@@ -1,22 +1,21 @@
 """Files that are whole or absent: written under a temporary name, flushed to the disk, then renamed."""
 
 import errno
-import glob
 import hashlib
 import os
-import time
-import uuid
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, MachineError
+from cnpgen.store.files.leftovers import temporary_name
 
 _HINTS = {
     errno.ENOSPC: "free some space and try again",
     errno.EDQUOT: "your quota is used up; free some space and try again",
     errno.EFBIG: "the file is larger than this system or session allows (see ulimit -f)",
-    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.EROFS: "choose another folder",
     errno.EACCES: "choose a folder that you may write to",
     errno.EPERM: "choose a folder that you may write to",
     errno.ENOTDIR: "a file is where a folder should be; choose another folder",
@@ -60,7 +59,7 @@ def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
         MachineError: The disk is full, read-only or otherwise unwilling. ``path`` is as it was; nothing is left behind.
     """
     folder = work or path.parent
-    temporary = folder / f".{path.name}.{os.getpid()}.{uuid.uuid4().hex}.tmp"
+    temporary = folder / temporary_name(path.name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,14 +96,23 @@ def write_file(path: Path, content: bytes | str, *, work: Path | None = None) ->
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def read_file(path: Path) -> bytes:
+def read_file(path: Path, *, most: int | None = None) -> bytes:
     """Read a whole file.
 
+    Args:
+        path: The file.
+        most: Size that it may have [bytes]; as large as it is by default.
+
     Raises:
-        DatasetError: There is no such file.
+        DatasetError: There is no such file, it is a device or a pipe, which has no end, or it is too large.
         MachineError: The system would not let us read it.
     """
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+            raise DatasetError(f"{path} is not a file")
+        if most is not None and status.st_size > most:
+            raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {most:,}")
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError) as error:
         raise DatasetError(f"{path} is missing") from error
@@ -126,35 +134,3 @@ def file_sha256(path: Path) -> str:
         raise DatasetError(f"{path} is missing") from error
     except OSError as error:
         raise machine_error("read", path, error) from error
-
-
-def sweep_dead(path: Path) -> None:
-    """Remove what processes that are no more have left of writing a file beside it."""
-    with suppress(OSError):
-        for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-            owner = leftover.name.removeprefix(f".{path.name}.").partition(".")[0]
-            if owner.isdigit() and not _is_alive(int(owner)):
-                leftover.unlink(missing_ok=True)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
-
-
-def sweep(work: Path, *, older_than: float = 3600.0) -> None:
-    """Remove what killed processes left in ``work``, but not what others, maybe on other machines, are writing now.
-
-    Args:
-        work: The folder for temporary files; what is not one of ours is kept.
-        older_than: Age of the files that surely nobody writes any more [s].
-    """
-    with suppress(OSError):
-        for leftover in work.glob(".*.tmp"):
-            if time.time() - leftover.stat().st_mtime >= older_than:
-                leftover.unlink(missing_ok=True)

@@ -1,0 +1,242 @@
+"""Clusters of dask and of ray, by their own interfaces: joblib's cannot say whether anybody is there to work."""
+
+import importlib
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
+from itertools import islice
+from typing import Any, TypeVar
+
+from cnpgen.errors import MachineError
+from cnpgen.machine.workers import DIED, signals_held
+
+LOOK_SECONDS = 1.0  # between two looks at who is there
+SILENT_SECONDS = 10.0  # without any worker until it is said for the first time; then after twice as long
+_LOG = logging.getLogger(__name__)
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Cluster(ABC):
+    """Workers of a cluster, which may come and go; what one of them did not finish is given to another."""
+
+    is_far = True
+
+    def __init__(self, what: str, workers: int | None) -> None:
+        self._what, self._workers = what, workers
+
+    @property
+    def size(self) -> int:
+        """Tasks that run at once."""
+        return self._workers or max(self.present(), 1)
+
+    def share_out(
+        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, advice: str = ""
+    ) -> Generator[R, None, None]:
+        """Run a function on every task and yield the results.
+
+        Raises:
+            MachineError: A task has ended several workers, or the cluster is gone.
+        """
+        submit, left = self.prepared(function), enumerate(tasks)
+        under_way: dict[Any, int] = {}
+        results: dict[int, R] = {}
+        following = 0
+        try:
+            while True:
+                for number, task in islice(left, max(2 * self.size - len(under_way), 0)):
+                    under_way[submit(task)] = number
+                if not under_way:
+                    return
+                for ticket in self._wait(list(under_way)):
+                    results[under_way.pop(ticket)] = self.result(ticket)
+                while results and (following in results or not ordered):
+                    yield results.pop(following if ordered else next(iter(results)))
+                    following += 1
+        except MachineError as error:
+            raise MachineError(f"{error}{advice}") from error
+        finally:
+            self.cancel(list(under_way))
+
+    def _wait(self, tickets: Sequence[Any]) -> Sequence[Any]:
+        """Wait until some are finished; say so where nobody works on them."""
+        alone, said = time.monotonic(), SILENT_SECONDS
+        while not (finished := self.finished(tickets, LOOK_SECONDS)):
+            if self.present():
+                alone, said = time.monotonic(), SILENT_SECONDS
+            elif time.monotonic() - alone >= said:
+                _LOG.warning("nobody is working: %s has had no worker for %.0f s; waiting for one", self._what, said)
+                said *= 2
+        return finished
+
+    @abstractmethod
+    def present(self) -> int:
+        """Count the tasks that the workers that are there could run at once."""
+
+    @abstractmethod
+    def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
+        """Return what submits a task of a function and returns a ticket for its result."""
+
+    @abstractmethod
+    def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
+        """Return those that are finished, after so long at most [s]."""
+
+    @abstractmethod
+    def result(self, ticket: Any) -> Any:
+        """Return the result of a finished task, or raise what it raised."""
+
+    @abstractmethod
+    def cancel(self, tickets: Sequence[Any]) -> None:
+        """Give up what is not finished."""
+
+
+class _Dask(Cluster):
+    def __init__(self, client: Any, what: str, workers: int | None) -> None:
+        super().__init__(what, workers)
+        self._client = client
+
+    def present(self) -> int:
+        with _gone(self._what):
+            return sum(self._client.nthreads().values())
+
+    def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
+        return partial(self._client.submit, function, pure=False)
+
+    def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
+        from distributed import wait
+
+        with suppress(TimeoutError), self._client.as_current():
+            return list(wait(tickets, timeout=seconds, return_when="FIRST_COMPLETED").done)
+        return []
+
+    def result(self, ticket: Any) -> Any:
+        from distributed.scheduler import KilledWorker
+
+        try:
+            return ticket.result()
+        except KilledWorker as error:
+            raise MachineError(DIED) from error
+        except _lost_of_dask() as error:
+            raise MachineError(f"{self._what} is gone") from error
+
+    def cancel(self, tickets: Sequence[Any]) -> None:
+        with suppress(Exception):  # whatever the cluster says: it is of no interest any more
+            self._client.cancel(tickets)
+
+
+def _lost_of_dask() -> tuple[type[BaseException], ...]:
+    from concurrent.futures import CancelledError
+
+    from distributed.client import FutureCancelledError
+
+    return CancelledError, FutureCancelledError
+
+
+@contextmanager
+def _gone(what: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:  # as are time-outs and closed connections
+        raise MachineError(f"{what} is gone: {error}") from error
+
+
+class _Ray(Cluster):
+    def present(self) -> int:
+        import ray
+
+        return int(ray.cluster_resources().get("CPU", 0))
+
+    def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
+        import ray
+
+        there = ray.put(function)
+        call = ray.remote(num_cpus=1, max_retries=3)(_call)
+        return partial(call.remote, there)
+
+    def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
+        import ray
+
+        done, _ = ray.wait(list(tickets), num_returns=1, timeout=seconds)
+        return list(done)
+
+    def result(self, ticket: Any) -> Any:
+        import ray
+
+        try:
+            return ray.get(ticket)
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        except ray.exceptions.RayError as error:
+            raise MachineError(f"{DIED}: {str(error).splitlines()[0]}") from error
+
+    def cancel(self, tickets: Sequence[Any]) -> None:
+        import ray
+
+        for ticket in tickets:
+            with suppress(Exception):  # whatever the cluster says: it is of no interest any more
+                ray.cancel(ticket)
+
+
+def _call(function: Callable[[T], R], task: T) -> R:
+    """Run a function on a task; ray hands over the function itself once."""
+    return function(task)
+
+
+@contextmanager
+def joined(name: str, address: str | None, workers: int | None) -> Iterator[Cluster]:
+    """Join a cluster, or start one on this machine; it is left, or ended, after the block.
+
+    Args:
+        name: "dask" or "ray".
+        address: Of its scheduler or head; None: one on this machine, for this block.
+        workers: Tasks that run at once; None: as many as its workers can.
+
+    Raises:
+        MachineError: Its package is not installed, or it cannot be reached.
+    """
+    module, join = {"dask": ("distributed", _dask), "ray": ("ray", _ray)}[name]
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise MachineError(f"{module} cannot be imported ({error}): pip install 'cnpgen[{name}]'") from error
+    what = f"the {name} cluster " + (f"at {address}" if address else "on this machine")
+    with join(address, workers, what) as cluster:
+        yield cluster
+
+
+@contextmanager
+def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Cluster]:
+    from distributed import Client
+
+    quiet = logging.CRITICAL  # what workers say that are ended while they work is no news
+    here: dict[str, Any] = {"n_workers": workers, "threads_per_worker": 1, "silence_logs": quiet}
+    here["dashboard_address"] = None
+    try:
+        with nullcontext() if address else signals_held():  # no worker of ours sees the Ctrl-C of a terminal
+            client = Client(address, set_as_default=False, **({} if address else here))
+    except (OSError, ValueError, TypeError) as error:
+        raise MachineError(f"cannot reach {what}: {error}") from error
+    with client:
+        yield _Dask(client, what, workers)
+
+
+@contextmanager
+def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluster]:
+    import ray
+
+    ours = not ray.is_initialized()
+    if ours:
+        here: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
+        try:
+            ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **here)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise MachineError(f"cannot reach {what}: {' '.join(str(error).split())}") from error
+    try:
+        yield _Ray(what, workers)
+    finally:
+        if ours:
+            ray.shutdown()

@@ -1,0 +1,270 @@
+"""Engines: what is chosen, what a cluster is asked for, and real clusters of processes on this machine."""
+
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.cli.main import main
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.machine import clusters
+from cnpgen.machine.clusters import Cluster
+from cnpgen.machine.engine import Engine, assembled
+from cnpgen.validate.dataset import validate_dataset
+from tests.conftest import HANGING
+from tests.examples.tiny_datasets import digests, make_tiny
+from tests.machine.test_workers import die_once
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_what_cannot_be_meant_is_refused_before_anything_is_made(tmp_path):
+    wrong = {
+        "engine 'dusk' does not exist: expected one of loky, dask, ray (did you mean 'dask'?)": {"engine": "dusk"},
+        "the address 'host:1' is that of a cluster: say of which with engine= (dask, ray)": {"address": "host:1"},
+        "workers must be an integer from 1 on, got 0": {"engine": "dask", "workers": 0},
+    }
+    for text, options in wrong.items():
+        with pytest.raises(UsageError, match=re.escape(text)):
+            make_tiny(tmp_path / "out", **options)
+        with pytest.raises(UsageError, match=re.escape(text)):
+            validate_dataset(tmp_path, **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_shell_says_its_options(tmp_path, capsys):
+    assert main(["make-dataset", "airhockey-hit", "--n", "10", "--address", "a:1", "-o", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.endswith("is that of a cluster: say of which with --engine (dask, ray)\n")
+
+
+def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with (
+        pytest.raises(MachineError, match=r"ray cannot be imported .*: pip install 'cnpgen\[ray\]'"),
+        assembled(Engine("ray"), 1),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("engine", "quick", "size"),
+    [(Engine("loky", None, 2), False, 2), (Engine("loky", None, 2), True, 2), (Engine(), True, 1)],
+)
+def test_processes_of_this_machine_are_as_many_as_were_asked_for_or_one_for_little(engine, quick, size):
+    with assembled(engine, 10, quick=quick) as team:
+        assert (team.size, team.is_far) == (size, False)
+        assert list(team.share_out(abs, range(-3, 3), ordered=True)) == [3, 2, 1, 0, 1, 2]
+
+
+# --- what any cluster is asked for ------------------------------------------------------------------------------------
+
+
+class Slow(Cluster):
+    """A cluster that finishes one task per look, the last one that it was given first, where somebody is there."""
+
+    def __init__(self, there: Callable[[], int] = lambda: 2) -> None:
+        super().__init__("the cluster of the test", None)
+        self.there, self.most, self.given_up = there, 0, 0
+
+    def present(self) -> int:
+        return self.there()
+
+    def prepared(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        return lambda task: (function, task)
+
+    def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
+        self.most = max(self.most, len(tickets))
+        return [tickets[-1]] if self.there() else []
+
+    def result(self, ticket: Any) -> Any:
+        function, task = ticket
+        return function(task)
+
+    def cancel(self, tickets: Sequence[Any]) -> None:
+        self.given_up = len(tickets)
+
+
+def test_a_cluster_is_given_two_tasks_per_worker_and_results_come_in_order_if_asked():
+    cluster = Slow()
+    assert list(cluster.share_out(abs, range(7))) == [3, 4, 5, 6, 2, 1, 0]
+    assert cluster.most == 4
+    assert list(cluster.share_out(abs, range(7), ordered=True)) == list(range(7))
+    assert cluster.given_up == 0
+
+
+def test_what_is_under_way_is_given_up_when_the_results_are_not_wanted_any_more():
+    cluster = Slow()
+    results = cluster.share_out(abs, range(100))
+    next(results)
+    results.close()
+    assert cluster.given_up == 3
+
+
+def fail(_task: int) -> None:
+    raise MachineError("a worker died (killed, or out of memory)")
+
+
+def test_what_ends_the_workers_says_what_to_do():
+    with pytest.raises(MachineError, match=r"^a worker died .*memory\): try again$"):
+        list(Slow().share_out(fail, range(3), advice=": try again"))
+
+
+def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplog):
+    looks = iter([2, *[0] * 6, 2, 2, 2, 2, 2])  # the first one asks how many tasks to give
+    now = [0.0]
+
+    def look() -> int:
+        now[0] += 10.0
+        return next(looks)
+
+    monkeypatch.setattr(clusters.time, "monotonic", lambda: now[0])
+    with caplog.at_level(logging.WARNING):
+        assert list(Slow(look).share_out(abs, [5])) == [5]
+    assert [record.getMessage() for record in caplog.records] == [
+        "nobody is working: the cluster of the test has had no worker for 10 s; waiting for one",
+        "nobody is working: the cluster of the test has had no worker for 20 s; waiting for one",
+        "nobody is working: the cluster of the test has had no worker for 40 s; waiting for one",
+    ]
+
+
+# --- real ones --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
+    """Start processes of dask in a folder of their own; they end with the test."""
+    started: list[subprocess.Popen] = []
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+
+    def run(kind: str, *options: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(tmp_path / "file")]
+        with (tmp_path / f"{kind}-{len(started)}.log").open("w") as log:
+            started.append(subprocess.Popen([*command, *options], cwd=elsewhere, env=environment, stderr=log))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def scheduler(start, tmp_path) -> str:
+    """The address of a scheduler of dask on the loopback interface, which has no workers yet."""
+    import json
+
+    pytest.importorskip("distributed")
+    start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-jupyter")
+    deadline = time.monotonic() + HANGING
+    while not (tmp_path / "file").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return json.loads((tmp_path / "file").read_text())["address"]
+
+
+WORKER = ("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")  # of dask's own
+def test_a_dataset_is_made_by_two_workers_of_dask_of_which_one_is_killed(tiny, tmp_path, monkeypatch, start, scheduler):
+    workers = [start(*WORKER) for _ in range(2)]
+    monkeypatch.chdir(tmp_path)
+    made = make_tiny(
+        Path("out"),
+        engine="dask",
+        address=scheduler,
+        workers=None,
+        shard_size=50,
+        progress=lambda *_: workers[0].kill(),
+    )
+    assert made.complete
+    make_tiny(tmp_path / "uncut", shard_size=50)
+    assert digests(tmp_path / "out") == digests(tmp_path / "uncut")
+    assert not list((tmp_path / "elsewhere").glob("out*"))
+    report = validate_dataset("out", deep=True, regenerate=1, engine="dask", address=scheduler)
+    assert report.ok
+    assert report.deep.rows == 660
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+def test_that_the_last_worker_of_dask_is_gone_is_said_until_another_one_comes(
+    tmp_path, monkeypatch, caplog, start, scheduler
+):
+    monkeypatch.setattr(clusters, "SILENT_SECONDS", 2.0)
+    first = start(*WORKER)
+
+    class Starter(logging.Handler):
+        """Starts another worker when it is said that there is none."""
+
+        def emit(self, record: logging.LogRecord) -> None:
+            logger.removeHandler(self)
+            start(*WORKER)
+
+    logger = logging.getLogger("cnpgen.machine.clusters")
+    logger.addHandler(Starter())
+    kill = {"progress": lambda *_: first.kill()}
+    made = make_tiny(tmp_path / "out", engine="dask", address=scheduler, workers=None, shard_size=50, **kill)
+    assert made.complete
+    assert (
+        f"nobody is working: the dask cluster at {scheduler} has had no worker for 2 s; waiting for one" in caplog.text
+    )
+
+
+def end_workers(_task: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", ["dask", "ray"])
+def test_a_task_that_ends_every_worker_is_a_machine_error(name):
+    pytest.importorskip({"dask": "distributed"}.get(name, name))
+    with (
+        assembled(Engine(name, None, 2), 3) as team,
+        pytest.raises(MachineError, match=r"^a worker died .*: try again$"),
+    ):
+        list(team.share_out(end_workers, range(3), advice=": try again"))
+
+
+def refuse(_task: int) -> None:
+    raise UsageError("not this one")
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+def test_ray_makes_the_same_bytes_and_gives_the_task_of_a_dead_worker_to_another(tiny, tmp_path):
+    ray = pytest.importorskip("ray")
+    with assembled(Engine("ray", None, 2), 6) as team:
+        assert sorted(team.share_out(partial(die_once, tmp_path / "died"), range(6))) == list(range(6))
+        assert (tmp_path / "died").exists()
+        with pytest.raises(UsageError, match=r"^not this one$"):
+            list(team.share_out(refuse, range(3)))
+        made = make_tiny(tmp_path / "out", engine="ray", workers=2)
+    assert not ray.is_initialized()
+    assert made.complete
+    assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", ["dask", "ray"])
+def test_plans_are_the_same_whichever_engine_makes_them(tmp_path, name):
+    pytest.importorskip({"dask": "distributed"}.get(name, name))
+    problems = cnpgen.draw_boundary_problems("airhockey-hit", 6, seed=3)
+    here = cnpgen.solve_plans(problems, workers=1)
+    there = cnpgen.solve_plans(problems, workers=2, engine=name, journal=tmp_path / "journal")
+    np.testing.assert_array_equal(there.plans.path_control_points, here.plans.path_control_points)
+    np.testing.assert_array_equal(there.plans.rate_control_points, here.plans.rate_control_points)
