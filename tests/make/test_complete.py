@@ -105,6 +105,9 @@ def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_pat
         file["goal_xyz"], file["hit_angle"] = np.zeros((2, 3)), [0.0]
     with h5py.File(tmp_path / "text.h5", "w") as file:
         file["goal_xyz"] = "here"
-    for name, message in (("long", "one value per task each, got goal_xyz"), ("text", "goal_xyz must hold numbers, got object")):
+    for name, message in (
+        ("long", "one value per task each, got goal_xyz"),
+        ("text", "goal_xyz must hold numbers, got object"),
+    ):
         with pytest.raises(DatasetError, match=message):
             complete_table("airhockey-replan", tmp_path / f"{name}.h5")
