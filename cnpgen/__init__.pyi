@@ -94,6 +94,7 @@ from cnpgen.refine.task import Refined as Refined
 from cnpgen.robots.spec import HeldObject as HeldObject
 from cnpgen.robots.spec import LimitSpec as LimitSpec
 from cnpgen.robots.spec import Obstacle as Obstacle
+from cnpgen.robots.spec import Payload as Payload
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
 from cnpgen.simulator.executed import Executed as Executed

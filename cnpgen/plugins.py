@@ -3,9 +3,21 @@
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.schema.keys import Range, field
+from cnpgen.schema.keys import PerJoint, Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.state import World
 
-__all__ = ["Condition", "Constraint", "Context", "Field", "Range", "Round", "Stage", "SymbolicState", "World", "field"]
+__all__ = [
+    "Condition",
+    "Constraint",
+    "Context",
+    "Field",
+    "PerJoint",
+    "Range",
+    "Round",
+    "Stage",
+    "SymbolicState",
+    "World",
+    "field",
+]

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cnpgen.cli.shape_rows import link_rows, pair_rows, shape_to_dict
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
-from cnpgen.schema.keys import Key, Range, keys
+from cnpgen.schema.keys import Key, PerJoint, Range, keys
 
 WIDTH = 100
 
@@ -72,11 +74,13 @@ def describe_problem(problem: Problem) -> str:
     spec = problem.robot
     facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
     facts += [("object", numbers(problem.object))] if problem.object else []
+    facts += [("payload", numbers(problem.payload))] if problem.payload else []
     facts += [("obstacle", f"{box.name}: {numbers(box, leave_out=('name',))}") for box in problem.obstacle]
     facts += [("motion", numbers(problem.trajectory))]
     objective = numbers(problem.objective)
     facts += [("objective", f"shortest time, and {objective}" if objective else "shortest time")]
     constraints = [(kind_name(item), numbers(item)) for item in problem.constraint]
+    robot = load_robot(problem)
     return "\n".join(
         [
             f"problem {problem.name}",
@@ -84,7 +88,8 @@ def describe_problem(problem: Problem) -> str:
             *table(facts, indent="  "),
             "",
             "  planning limits",
-            *table(_limit_rows(problem), indent="    "),
+            *table(_limit_rows(robot), indent="    "),
+            *_shape(robot),
             "",
             "  constraints",
             *table(constraints or [("none", "")], indent="    "),
@@ -92,8 +97,23 @@ def describe_problem(problem: Problem) -> str:
     )
 
 
-def _limit_rows(problem: Problem) -> list[tuple[str, ...]]:
-    robot = load_robot(problem)
+def _shape(robot: Robot) -> list[str]:
+    """Describe the robot's shape: its links, and its pairs of links."""
+    if robot.shape is None:
+        return []
+    links, pairs = link_rows(robot.shape), pair_rows(robot.shape)
+    numbers_of_links, numbers_of_pairs = range(1, 6), (2, 3)
+    return [
+        "",
+        "  shape: what the collision geometry of the URDF says, and capsules that cover it",
+        *table(links, indent="    ", right=numbers_of_links),
+        "",
+        "  pairs of links, by random states",
+        *table(pairs, indent="    ", right=numbers_of_pairs),
+    ]
+
+
+def _limit_rows(robot: Robot) -> list[tuple[str, ...]]:
     head = ("joint", "position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]", "torque [N m]", "base [rad]")
     columns = (robot.velocity_limit, robot.acceleration_limit, robot.torque_limit, robot.base)
     ranges = zip(robot.position_lower, robot.position_upper, strict=True)
@@ -127,6 +147,8 @@ def quantity(value: Any, unit: str = "1") -> str:
 def _number(value: Any) -> str:
     if isinstance(value, Range):
         return f"[{value.low:.6g}, {value.high:.6g}]" if value.low < value.high else f"{value.low:.6g}"
+    if isinstance(value, PerJoint):
+        return _number(value.values)
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -183,7 +205,7 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
         RecipeError: There is no such kind.
     """
     kind = registry.load(group, name)
-    left_out = ("hint", "default")
+    left_out = ("hint", "default", "late")
     entries = [
         {
             **{field.name: getattr(key, field.name) for field in dataclasses.fields(key) if field.name not in left_out},
@@ -215,6 +237,8 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
         content["recipe_sha256"] = recipe_digest(pipeline)
         content["stages"] = [{"use": kind_name(stage), "text": stage.describe()} for stage in pipeline.stage]
     content["joints"] = list(robot.joint_names)
+    if robot.shape:
+        content["shape"] = shape_to_dict(robot.shape)
     content["limits"] = {name: {"unit": unit, "values": list(getattr(robot, name))} for name, unit in LIMITS.items()}
     return content
 

@@ -29,8 +29,8 @@ def published(constraint: Constraint, state: SymbolicState) -> tuple[Condition, 
 
     if isinstance(constraint, Vertical):
         return _zero("orientation", "1", 1 - state.kinematics.rotation[2][2])
-    if isinstance(constraint, RobotClearance):
-        near = (constraint.radius - _distance(point, state.boxes) for point in _points(state))
+    if isinstance(constraint, RobotClearance) and (radius := constraint.radius) is not None:
+        near = (radius - _distance(point, state.boxes) for point in _points(state))
         return _zero("robot clearance", "m", sum(ca.fmax(x, 0) for x in near))
     if isinstance(constraint, ObjectContact):
         deep = (-_depth(corner, box) - constraint.depth for corner in _corners(state) for box in state.boxes)

@@ -10,7 +10,8 @@ import numpy as np
 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import sample_tops
-from cnpgen.pipelines.stages.stage import Array, Round, Work
+from cnpgen.pipelines.stages.stage import Round, Work
+from cnpgen.pipelines.undecided import settle, unmet
 from cnpgen.problems.constraints.constraint import EXACTNESS, End
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
@@ -48,24 +49,28 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
         )
         for end in ends
     }
+    decisions = {end: settle(context, end, exact=end not in given) for end in ends}
     hitting = context.kernels.load(direction_unmet, dtype=context.dtype) if "hit_angle" in written else None
     reasons = [constraint.reason for constraint in context.problem.constraint]
     n = context.robot.n
 
     def work(draws: Round, _random: np.random.Generator) -> None:
         tops = sample_tops(context.problem, draws)
-        unmet = []
+        missed = []
         for end in ends:
             acceleration = draws.columns.get(f"{end}_ddq")
             if acceleration is None:
                 acceleration = np.zeros((n, len(draws.alive)))
-            (count,) = kernels[end](draws[f"{end}_q"], draws[f"{end}_dq"], acceleration, tops, draws[f"{end}_xyz"])
-            unmet.append(count)
-        met = np.maximum(*unmet) <= 0
+            state = draws[f"{end}_q"], draws[f"{end}_dq"], acceleration
+            (count,) = kernels[end](*state, tops, draws[f"{end}_xyz"])
+            if decide := decisions[end]:
+                count[: len(reasons)] += decide(state, tops, count.max(axis=0) <= 0)
+            missed.append(count)
+        met = np.maximum(*missed) <= 0
         gates = list(zip([*reasons, "tip not at its position"], met, strict=True))
         if hitting is not None:
-            (missed,) = hitting(draws["goal_q"], draws["goal_dq"], draws["hit_angle"], draws["hit_speed"])
-            gates.append(("hit not along its direction", missed[0] <= 0))
+            (off,) = hitting(draws["goal_q"], draws["goal_dq"], draws["hit_angle"], draws["hit_speed"])
+            gates.append(("hit not along its direction", off[0] <= 0))
         alive = draws.alive
         for reason, ok in gates:
             left = ok if len(draws.alive) == len(alive) else ok[np.searchsorted(alive, draws.alive)]
@@ -76,6 +81,8 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
 
 def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True) -> Any:
     """Build ``(q, dq, ddq, tops, position) -> unmet``, positive where a boundary state is not exact or not a number.
+
+    Conditions that ask for more than is meant are left to ``cnpgen.pipelines.undecided``.
 
     Args:
         robot: The robot.
@@ -97,29 +104,16 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
     rows: list[Scalar] = []
     for constraint in problem.constraint:
-        unmet: Scalar = ca.SX(0)
+        count: Scalar = ca.SX(0)
         along = {each.name: constraint.allowed(each) for each in constraint.symbolic(state)}
-        for condition in constraint.symbolic_at(state, end):
+        for condition in (each for each in constraint.symbolic_at(state, end) if not each.sufficient):
             if symbolic_needs(condition, dq_sx, ddq_sx) <= needs and (exact or condition.name in along):
                 slack = condition.slack(dtype) if exact else np.maximum(along[condition.name], condition.slack(dtype))
-                unmet = unmet + _unmet(condition.g, condition.lower, condition.upper, slack)
-        rows.append(unmet)
+                count = count + unmet(condition, slack)
+        rows.append(count)
     miss = subtract(p, state.kinematics.tip)
     rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= EXACTNESS[dtype]["position"]))
     return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, tops_sx, p_sx], [ca.vertcat(*rows)])
-
-
-def _unmet(g: list[Scalar], lower: Array, upper: Array, slack: Array) -> Scalar:
-    """Count the values that are not within their bounds; a nan is within none."""
-    import casadi as ca
-
-    count: Scalar = ca.SX(0)
-    for value, low, high, room in zip(g, lower, upper, slack, strict=True):
-        if np.isfinite(low):
-            count = count + ca.logic_not(value >= float(low - room))
-        if np.isfinite(high):
-            count = count + ca.logic_not(value <= float(high + room))
-    return count
 
 
 def direction_unmet(robot: "Robot", *, dtype: str) -> Any:

@@ -1,14 +1,18 @@
 """What a problem file must say that is about several of its tables, or about the URDF beside it."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
 from cnpgen.schema.units import show
+
+_XACRO = "{http://www.ros.org/wiki/xacro}"
 
 
 def problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
@@ -37,13 +41,34 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
         tree = urdf_tree(read_urdf(path))
     except (RecipeError, ValueError):  # whoever loads the robot says so
         return
+    if any(part.tag.startswith(_XACRO) for part in tree.iter()):
+        text = f"{path.name} is to be read by xacro, expected a URDF: run 'xacro {path.name} > robot.urdf'"
+        yield (where / "urdf").says(text)
+        return
     moving = [joint.get("name", "") for joint in tree.iter("joint") if joint.get("type", "fixed") != "fixed"]
     for name in joints if isinstance(joints, list) else ():
         if isinstance(name, str) and name not in moving:
             yield (where / "joints").says(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
     frames = [part.get("name", "") for kind in ("link", "joint") for part in tree.iter(kind)]
     if isinstance(tip, str) and tip not in frames:
-        yield (where / "tip").says(f"{path.name} has no frame {tip!r}{nearest(tip, frames)}")
+        text = f"{path.name} has no frame {tip!r}{nearest(tip, frames)}"
+        yield (where / "tip").says(f"{text}; its frames: {', '.join(frames)}")
+    for name, low, high in _locked_outside(tree.iter("joint"), joints if isinstance(joints, list) else []):
+        text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
+        yield (where / "joints").says(text)
+
+
+def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -> Iterator[tuple[str, float, float]]:
+    """List joints that are not planned and cannot stand at zero, with their limits; those that mimic are left out."""
+    for joint in joints:
+        limit, name = joint.find("limit"), joint.get("name", "")
+        movable = joint.get("type") in ("revolute", "prismatic") and joint.find("mimic") is None
+        if limit is None or not movable or name in planned:
+            continue
+        with suppress(ValueError):  # numbers that are none are for Pinocchio to refuse
+            low, high = (float(limit.get(key, "0")) for key in ("lower", "upper"))
+            if not low <= 0 <= high and low <= high:
+                yield name, low, high
 
 
 def _repeated(table: dict[str, Any], where: Place, array: str, key: str) -> Iterator[str]:

@@ -8,7 +8,8 @@ from typing import Any
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.problem import Problem
+from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes
+from cnpgen.problems.problem import FILES, Problem
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
@@ -69,9 +70,11 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
     before = len(mistakes)
     mistakes.extend(problem_mistakes(table, where, path.parent))
+    mistakes.extend(geometry_mistakes(table, where, path.parent))
     if problem is None or len(mistakes) > before:
         return None
-    return replace(problem, path=path.absolute())
+    spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
+    return replace(problem, path=path.absolute(), robot=spec)
 
 
 def without_defaults(value: Any) -> Any:
@@ -113,7 +116,8 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
     def read(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
         if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
             raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
-        value = {**value, "robot": {**value["robot"], "urdf": "robot.urdf"}}
+        robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
+        value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
         readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
         return made and replace(made, path=path)

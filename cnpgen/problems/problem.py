@@ -11,7 +11,9 @@ from typing import Any
 
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.robots.spec import HeldObject, LimitSpec, Obstacle, RobotSpec
+from cnpgen.robots.shape.inline import with_inline_meshes
+from cnpgen.robots.shape.srdf import with_disabled_pairs
+from cnpgen.robots.spec import HeldObject, LimitSpec, Obstacle, Payload, RobotSpec
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.keys import NAME, field, to_dict
@@ -43,6 +45,7 @@ class Problem:
     robot: RobotSpec = field("the robot")
     limits: LimitSpec = field("its planning limits")
     object: HeldObject | None = field("what it holds", default=None)
+    payload: Payload | None = field("what else it carries at its tip", default=None, late=True)
     obstacle: tuple[Obstacle, ...] = field("the boxes of the world", default=(), form="[[obstacle]] tables")
     constraint: tuple[Constraint, ...] = field("the constraint manifold", default=(), form="[[constraint]] tables")
     trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
@@ -73,10 +76,16 @@ class Problem:
     def urdf_text(self) -> str:
         """The URDF, read once: the robot, its kernels and the identity are of one text, whatever becomes of the file.
 
+        Where the robot has its real shape, the hulls of its meshes and the pairs of an SRDF are part of the text.
+
         Raises:
-            RecipeError: The file cannot be read, or is not UTF-8.
+            RecipeError: The file cannot be read, or is not UTF-8; or a mesh or the SRDF.
         """
-        return read_urdf(self.urdf_path)
+        text, folder, spec = read_urdf(self.urdf_path), self.path.parent, self.robot
+        if spec.geometry != "urdf":
+            return text
+        text = with_inline_meshes(text, self.urdf_path, [folder / each for each in spec.packages])
+        return with_disabled_pairs(text, folder / spec.srdf) if spec.srdf else text
 
     @cached_property
     def identity(self) -> str:
@@ -87,6 +96,13 @@ class Problem:
         """
         content = json.dumps(without_labels(to_dict(self, label=_all_of)), sort_keys=True)
         return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
+
+
+FILES = (
+    "urdf",
+    "packages",
+    "srdf",
+)  # keys of [robot] that say where something is: what was there is in the URDF's text
 
 
 def resolved(recipe: object) -> dict[str, Any]:
@@ -116,6 +132,6 @@ def _all_of(obj: object) -> dict[str, str]:
 
 
 def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out of a resolved problem what changes nothing but how it is shown or found: title and name of the URDF."""
-    robot = {key: value for key, value in problem["robot"].items() if key != "urdf"}
+    """Leave out of a resolved problem what changes nothing but how it is shown or found: title and names of files."""
+    robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
     return {key: value for key, value in problem.items() if key != "title"} | {"robot": robot}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load import load_problem_behind, restore_problem
-from cnpgen.problems.problem import Problem, resolved
+from cnpgen.problems.problem import FILES, Problem, resolved
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import parse
@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _MOVING = ("revolute", "continuous", "prismatic")
+_SCALES = ("position_scale", "velocity_scale", "acceleration_rate", "acceleration_cap", "torque_scale")
 _FORM = {
     "name": TEXT,
     "robot": {"urdf": TEXT, "joints": [TEXT], "tip": TEXT, "base": [NUMBER]},
-    "limits": {EVERY: NUMBER},
+    "limits": dict.fromkeys(_SCALES, NUMBER),
     "constraint": [{"use": TEXT}],
     "trajectory": {EVERY: WHOLE},
 }
@@ -203,7 +204,7 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
     kept = {
         key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}
     }
-    robot = {key: value for key, value in kept["robot"].items() if key not in {"urdf", "base"}}
+    robot = {key: value for key, value in kept["robot"].items() if key not in {*FILES, "base"}}
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
     constraints: dict[str, Any] = {}
     for kind in kept["constraint"]:

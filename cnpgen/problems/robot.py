@@ -1,13 +1,23 @@
 """The robot of a problem: the URDF's limits scaled as the problem says, and what does not fit."""
 
+import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.attached import Attached, Body
 from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.robot import Robot, reduced_model
+from cnpgen.robots.shape.piece import turned
+from cnpgen.robots.shape.shape import Shape, load_shape
+from cnpgen.schema.keys import PerJoint
+
+Array = NDArray[np.float64]
 
 
 def load_robot(problem: Problem) -> Robot:
@@ -18,31 +28,81 @@ def load_robot(problem: Problem) -> Robot:
     """
     spec, limits = problem.robot, problem.limits
     try:
-        urdf = problem.urdf_text
-        model = reduced_model(problem.urdf_path, urdf, spec.joints)
-        chain = chain_from_model(model, spec.tip)
+        urdf, attached = problem.urdf_text, _attached(problem)
+        model = reduced_model(problem.urdf_path, urdf, spec.joints, attached)
+        chain = chain_from_model(model, attached.tip)
+        rated = _given(limits.velocity, "velocity", model.velocityLimit)
+        torque = _given(limits.torque, "torque", model.effortLimit)
+        velocity = limits.velocity_scale * rated
+        most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
+        acceleration = _given(limits.acceleration, "acceleration", most)
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
-    velocity = limits.velocity_scale * np.array(model.velocityLimit)
     middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
     robot = Robot(
         urdf=problem.urdf_path,
         urdf_text=urdf,
         joint_names=tuple(spec.joints),
-        tip=spec.tip,
+        tip=attached.tip,
+        attached=attached,
         position_lower=middle - half,
         position_upper=middle + half,
         velocity_limit=velocity,
-        acceleration_limit=np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap),
-        torque_limit=limits.torque_scale * np.array(model.effortLimit),
-        rated_velocity=np.array(model.velocityLimit),
+        acceleration_limit=acceleration,
+        torque_limit=limits.torque_scale * torque,
+        rated_velocity=rated,
         base=np.array(spec.base),
         chain=chain,
     )
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
-    return robot
+    return robot if spec.geometry != "urdf" else replace(robot, shape=_shape(problem, robot))
+
+
+def _attached(problem: Problem) -> Attached:
+    """Return what the problem adds to the URDF's robot."""
+    spec, ranges, payload = problem.robot, problem.limits.position or (), problem.payload
+    if ranges and len(ranges) != len(spec.joints):
+        raise RecipeError(
+            [f"limits.position: needs {len(spec.joints)} ranges, one per planned joint, got {len(ranges)}"]
+        )
+    return Attached(
+        spec.tip,
+        rotation=turned(*spec.tip_rotation),
+        translation=np.array(spec.tip_offset),
+        payload=Body(payload.mass, np.array(payload.centre), payload.moments) if payload else None,
+        ranges={name: (each.low, each.high) for name, each in zip(spec.joints, ranges, strict=False)},
+    )
+
+
+def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
+    """Return limits that the problem gives, for all joints, or those that count where it gives none."""
+    if values is None:
+        return np.array(otherwise)
+    if len(values.values) not in (1, len(otherwise)):
+        n, found = len(otherwise), len(values.values)
+        raise RecipeError([f"limits.{what}: needs one number, or {n}, one per planned joint, got {found}"])
+    return np.broadcast_to(np.array(values.values), len(otherwise)).copy()
+
+
+def _shape(problem: Problem, robot: Robot) -> Shape:
+    """Load the shape of the robot; warn of collisions that an SRDF disables, where the problem's file names one."""
+    from cnpgen.kernels.cache import default_cache_folder  # whoever judges robots without a shape loads nothing of it
+
+    try:
+        shape = load_shape(robot.urdf_text, robot.model, default_cache_folder())
+    except RecipeError as error:
+        raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
+    for pair in shape.pairs if problem.robot.srdf else ():
+        if pair.left_out == "disabled" and pair.colliding:
+            warnings.warn(
+                f"{problem.robot.srdf} disables the pair {pair.first}, {pair.second}, which collides in"
+                f" {pair.colliding:.1%} of random states: these collisions are not noticed",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+    return shape
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
@@ -52,12 +112,22 @@ def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
         for name, value in zip(robot.joint_names, values, strict=True):
             if not (np.isfinite(value) and value > 0):
                 yield f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
+    if any(isinstance(constraint, JointTorque) for constraint in problem.constraint):
+        yield from _weightless(robot)
     low, high = np.array(robot.model.lowerPositionLimit), np.array(robot.model.upperPositionLimit)
     for joint in np.flatnonzero(~(low < high)):
         text = f"the lower position limit must be below the upper one, got {low[joint]:g} and {high[joint]:g}"
         yield f"{robot.urdf}: {robot.joint_names[joint]}: {text}"
     if (low < high).all():
         yield from _base_mistakes(problem, robot)
+
+
+def _weightless(robot: Robot) -> Iterator[str]:
+    """Say which joints move nothing that has a mass, so that there are no torques to keep within limits."""
+    mass = np.cumsum([joint.mass for joint in robot.chain.joints][::-1])[::-1]
+    for name in np.array(robot.joint_names)[mass <= 0].tolist():
+        text = "no link that it moves has a mass, so that its torque means nothing: give the links an <inertial>"
+        yield f"{robot.urdf}: {name}: {text}, or leave out the constraint 'joint-torque'"
 
 
 def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:

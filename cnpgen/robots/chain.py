@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import RecipeError
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 LINK = " (link)"  # behind the name of a link that a joint has, too
 _PLANNED = "only revolute and prismatic joints can be planned"
 _KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
-    "JointModelRUB": "a continuous joint, which has no limits (make it revolute, with limits)",
+    "JointModelRUB": "a continuous joint, which has no limits (give ranges to all joints: 'position' in [limits])",
     "JointModelFreeFlyer": "a floating joint",
     "JointModelPlanar": "a planar joint",
     "JointModelSpherical": "a spherical joint",
@@ -84,9 +84,6 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
         if model.parents[index] != index - 1:
             before = model.names[index - 1]
             raise RecipeError([f"robot.joints: {name!r} is not moved by {before!r}, expected one serial chain"])
-    if not model.existFrame(tip):
-        known = [frame.name for frame in model.frames]
-        raise RecipeError([f"robot.tip: {model.name} has no frame {tip!r}{nearest(tip, known)}"])
     frame = model.frames[frame_of(model, tip)]
     if frame.parentJoint != model.njoints - 1:
         raise RecipeError([f"robot.tip: frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
+from cnpgen.robots.attached import Attached, attach, bounded
 from cnpgen.robots.chain import Chain, frame_of, tell_links_apart
 from cnpgen.robots.mimic import check_mimic
+from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
@@ -30,7 +32,8 @@ class Robot:
         urdf: The URDF file, for messages: it may be gone.
         urdf_text: What was in it.
         joint_names: The n planned joints; every other joint of the URDF stays at zero.
-        tip: Name of the frame that the task is about.
+        tip: Name of the frame that the task is about, as the model has it.
+        attached: What the problem adds to the URDF's robot.
         position_lower: Planning limits of joint positions [rad], shape (n,).
         position_upper: Likewise, shape (n,).
         velocity_limit: Symmetric planning limit of joint velocities [rad/s], shape (n,).
@@ -39,12 +42,14 @@ class Robot:
         rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
         base: Base configuration [rad], shape (n,).
         chain: The numbers of the kinematic chain from the world to the tip.
+        shape: Its collision geometry; None where it is the paper's, a line through the joints' origins.
     """
 
     urdf: Path
     urdf_text: str
     joint_names: tuple[str, ...]
     tip: str
+    attached: Attached
     position_lower: Array
     position_upper: Array
     velocity_limit: Array
@@ -53,6 +58,7 @@ class Robot:
     rated_velocity: Array
     base: Array
     chain: Chain
+    shape: Shape | None = None
 
     @property
     def n(self) -> int:
@@ -76,7 +82,7 @@ class Robot:
     @cached_property
     def model(self) -> "pin.Model":
         """The Pinocchio model reduced to the planned joints."""
-        return reduced_model(self.urdf, self.urdf_text, self.joint_names)
+        return reduced_model(self.urdf, self.urdf_text, self.joint_names, self.attached)
 
     @cached_property
     def tip_frame(self) -> int:
@@ -84,13 +90,14 @@ class Robot:
         return frame_of(self.model, self.tip)
 
 
-def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model":
-    """Build the Pinocchio model of a URDF, reduced to the planned joints.
+def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Attached) -> "pin.Model":
+    """Build the Pinocchio model of a URDF, reduced to the planned joints, with what a problem adds to it.
 
     Args:
         urdf: The URDF file, for messages.
         text: What is in it.
         joints: The planned joints; all others are locked at zero.
+        attached: What is added.
 
     Raises:
         RecipeError: It is no URDF, or the joints are not in it in this order.
@@ -98,8 +105,9 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model"
     import pinocchio as pin
 
     try:
-        check_mimic(urdf_tree(text), joints)
-        model = pin.buildModelFromXML(text)
+        tree = urdf_tree(text)
+        check_mimic(tree, joints)
+        model = pin.buildModelFromXML(bounded(text, tree, attached))
         tell_links_apart(model)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
@@ -111,6 +119,7 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model"
     reduced = pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
     if tuple(reduced.names)[1:] != tuple(joints):
         raise RecipeError([f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"])
+    attach(reduced, attached)
     return reduced
 
 

@@ -24,6 +24,17 @@ class Range:
     high: float
 
 
+@dataclass(frozen=True)
+class PerJoint:
+    """One number for every planned joint: ``"2 rad/s"`` for all of them, or a list.
+
+    Attributes:
+        values: The numbers, SI unit; one, or one per joint.
+    """
+
+    values: tuple[float, ...]
+
+
 def field(
     doc: str,
     *,
@@ -34,6 +45,7 @@ def field(
     choices: tuple[str, ...] = (),
     pattern: str = "",
     form: str = "",
+    late: bool = False,
 ) -> Any:
     """Declare a key of a recipe table.
 
@@ -46,12 +58,14 @@ def field(
         choices: Allowed strings.
         pattern: Regular expression that a string, or the names in a table of integers, must match.
         form: How the value is written, where the type does not say it.
+        late: Whether recipes were written down before there was this key: at its default it is left out, so that they
+            keep their digests.
 
     Returns:
         A dataclass field with this as metadata.
     """
     bounds = {"low": low, "high": high, "choices": choices, "pattern": pattern}
-    return dataclasses.field(default=default, metadata={"doc": doc, "unit": unit, "form": form, **bounds})
+    return dataclasses.field(default=default, metadata={"doc": doc, "unit": unit, "form": form, "late": late, **bounds})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +88,7 @@ class Key:
     choices: tuple[str, ...]
     pattern: str
     form: str
+    late: bool
 
     @property
     def required(self) -> bool:
@@ -130,12 +145,18 @@ def to_dict(obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {
         obj: The object; its fields that are no keys are left out.
         label: What else to write for a nested object, such as its registered name.
     """
-    return {**label(obj), **{key.name: _plain(getattr(obj, key.name), label) for key in keys(type(obj))}}
+    values = ((key, getattr(obj, key.name)) for key in keys(type(obj)))
+    return {
+        **label(obj),
+        **{k.name: _plain(value, label) for k, value in values if not (k.late and value == k.default)},
+    }
 
 
 def _plain(value: Any, label: Callable[[Any], Mapping[str, Any]]) -> Any:
     if isinstance(value, Range):
         return [value.low, value.high]
+    if isinstance(value, PerJoint):
+        return list(value.values)
     if dataclasses.is_dataclass(value):
         return to_dict(value, label=label)
     if isinstance(value, tuple):
@@ -159,6 +180,8 @@ def _expected(hint: Any, unit: str) -> str:
         return f"{count}, each {_expected(args[0], unit)}"
     if get_origin(hint) is dict:
         return "a table of integers"
+    if hint is PerJoint:
+        return f"{dimension(unit)}, or a list of them, one per planned joint"
     if hint in (float, Range):
         return dimension(unit) if hint is float else f"a range, each end {dimension(unit)}"
     return {int: "an integer", bool: "true or false", str: "a string"}.get(hint, "a table")

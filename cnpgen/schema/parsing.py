@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass
 from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
 from cnpgen.errors import nearest
-from cnpgen.schema.keys import Key, Place, Range, keys
+from cnpgen.schema.keys import Key, PerJoint, Place, Range, keys
 from cnpgen.schema.units import parse_number, parse_numbers, parse_range, show
 
 T = TypeVar("T")
@@ -195,6 +195,11 @@ def _range(value: Any, key: Key) -> Range:
     return Range(_bounded(low, key), _bounded(high, key))
 
 
+def _per_joint(value: Any, key: Key) -> PerJoint:
+    several = isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("["))
+    return PerJoint(_floats(value, key, None) if several else (_float(value, key),))
+
+
 def _floats(value: Any, key: Key, count: int | None) -> tuple[float, ...]:
     return tuple(_bounded(number, key) for number in parse_numbers(value, key.unit, count=count))
 
@@ -211,4 +216,11 @@ def _bounded(number: _Number, key: Key) -> _Number:
     return number
 
 
-_LEAVES: dict[Any, Callable[[Any, Key], Any]] = {float: _float, int: _int, bool: _bool, str: _str, Range: _range}
+_LEAVES: dict[Any, Callable[[Any, Key], Any]] = {
+    float: _float,
+    int: _int,
+    bool: _bool,
+    str: _str,
+    Range: _range,
+    PerJoint: _per_joint,
+}

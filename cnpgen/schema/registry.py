@@ -57,6 +57,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "pose": "cnpgen.problems.constraints.pose:Pose",
         "tip-speed": "cnpgen.problems.constraints.tip_speed:TipSpeed",
         "robot-clearance": "cnpgen.problems.constraints.clearance:RobotClearance",
+        "self-clearance": "cnpgen.problems.constraints.self_clearance:SelfClearance",
         "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
     },
     PLANNERS: {

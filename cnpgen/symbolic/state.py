@@ -16,6 +16,7 @@ from cnpgen.symbolic.linalg import Scalar, add, cross, dot, scale, subtract
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
+    from cnpgen.robots.shape.capsule import Capsule
     from cnpgen.robots.spec import Obstacle
 
 Vec = list[Scalar]
@@ -32,6 +33,7 @@ class Kinematics:
         rotation: Tip rotation, 3 rows of 3.
         jacobian: Columns dp/dq_i [m/rad], n lists of 3.
         turning: Whether joint i is revolute.
+        frames: Rotations of the joints' frames, n times 3 rows of 3.
     """
 
     axes: list[Vec]
@@ -40,6 +42,7 @@ class Kinematics:
     rotation: list[Vec]
     jacobian: list[Vec]
     turning: list[bool]
+    frames: list[list[Vec]]
 
 
 def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
@@ -51,7 +54,7 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
     """
     rotation: list[Vec] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     position: Vec = [0.0, 0.0, 0.0]
-    axes, origins = [], []
+    axes, origins, frames = [], [], []
     for joint, angle in zip(chain.joints, q, strict=True):
         position = add(position, _times(rotation, _constants(joint.translation)))
         rotation = _product(rotation, _product(_rows(joint.rotation), _turn(joint, angle)))
@@ -60,10 +63,11 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
             position = add(position, scale(axis, angle))
         axes.append(axis)
         origins.append(position)
+        frames.append(rotation)
     tip = add(position, _times(rotation, _constants(chain.tip_translation)))
     turning = [not joint.prismatic for joint in chain.joints]
     jacobian = [cross(z, subtract(tip, o)) if turns else z for z, o, turns in zip(axes, origins, turning, strict=True)]
-    return Kinematics(axes, origins, tip, _product(rotation, _rows(chain.tip_rotation)), jacobian, turning)
+    return Kinematics(axes, origins, tip, _product(rotation, _rows(chain.tip_rotation)), jacobian, turning, frames)
 
 
 def tip_velocity(kin: Kinematics, dq: Vec) -> Vec:
@@ -243,6 +247,20 @@ class SymbolicState:
         """The moving segments of the robot's skeleton: pairs of points [m]."""
         points = [*self.kinematics.origins, self.kinematics.tip]
         return [(points[a], points[b]) for a, b in self.robot.skeleton]
+
+    @cached_property
+    def capsules(self) -> dict[str, tuple[Vec, Vec, float]]:
+        """Link -> both ends [m] and the radius [m] of its capsule; nothing for a robot without a shape."""
+        shape = self.robot.shape
+        found = () if shape is None else ((each, shape.joints[each.link]) for each in shape.capsules)
+        return {capsule.link: self._placed(capsule, joint) for capsule, joint in found}
+
+    def _placed(self, capsule: "Capsule", joint: int) -> tuple[Vec, Vec, float]:
+        first, second = _constants(capsule.first), _constants(capsule.second)
+        if joint == 0:
+            return first, second, capsule.radius
+        rotation, origin = self.kinematics.frames[joint - 1], self.kinematics.origins[joint - 1]
+        return add(origin, _times(rotation, first)), add(origin, _times(rotation, second)), capsule.radius
 
     @property
     def boxes(self) -> list[list[tuple[Scalar | None, Scalar | None]]]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.world.bodies import NO_SHAPE, Bodies
 from cnpgen.world.scene import ENDLESS, Scene
 from cnpgen.world.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
 from cnpgen.world.sweep import sweep
@@ -37,6 +38,7 @@ class PathWorld:
 
     Attributes:
         robot: The robot.
+        obstacles: The boxes of the world.
         q: Joint positions [rad], shape (n, K).
         dq: Joint velocities [rad/s], shape (n, K).
         ddq: Joint accelerations [rad/s^2], shape (n, K).
@@ -53,7 +55,7 @@ class PathWorld:
         import pinocchio as pin
 
         self.robot = robot
-        self._obstacles = tuple(obstacles)
+        self.obstacles = tuple(obstacles)
         self._model = robot.model
         self._data = self._model.createData()
         self._pool = pin.ModelPool(self._model, 1)
@@ -61,6 +63,7 @@ class PathWorld:
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
         self._object_size = None if object_size is None else np.array(object_size)
         self._scene = Scene(obstacles, object_size, 1)
+        self._bodies = None if robot.shape is None else Bodies(robot.shape, obstacles, robot.n)
         rest = np.zeros((robot.n, 1))
         self.set_path(robot.base[:, None], rest, rest, np.zeros(len(obstacles)))
 
@@ -74,6 +77,7 @@ class PathWorld:
             tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
         """
         self.q, self.dq, self.ddq = q, dq, ddq
+        self._placed = False
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
@@ -82,17 +86,18 @@ class PathWorld:
             Box(
                 np.array([box.x.low, box.y.low, top - (box.height or ENDLESS)]), np.array([box.x.high, box.y.high, top])
             )
-            for box, top in zip(self._obstacles, tops.tolist(), strict=True)
+            for box, top in zip(self.obstacles, tops.tolist(), strict=True)
         ]
+        self._tops = tops
         self._scene.set_tops(tops.tolist())
-        self._move(with_skeleton=bool(self._boxes))
+        self._move(with_skeleton=bool(self._boxes) and self._bodies is None)
 
     def _move(self, *, with_skeleton: bool) -> None:
         """Run the forward kinematics of every state and keep where the tip is, and the skeleton."""
         frame, n = self._model.frames[self._tip], self.robot.n
         used = sorted({*self._skeleton.ravel().tolist()} - {n}) if with_skeleton else []
         joints = [frame.parentJoint, *(point + 1 for point in used)]
-        rotation, points = trace(self._model, self._data, self.q, joints)
+        (rotation,), points = trace(self._model, self._data, self.q, joints)
         placement = frame.placement
         self.tip_rotation = np.tensordot(placement.rotation.T, rotation, axes=(1, 1)).transpose(1, 0, 2)
         self.tip_position = np.tensordot(placement.translation, rotation, axes=(0, 1)) + points[0]
@@ -160,6 +165,44 @@ class PathWorld:
 
         every = np.array(bounds).reshape(len(bounds), self.q.shape[1])
         return list(sweep(every, measure, lambda pair, direction: separation(*ends[pair], direction)))
+
+    def shape_distances(self) -> list[Array]:
+        """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
+
+        Returns:
+            Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
+
+        Raises:
+            RecipeError: The robot has no shape.
+        """
+        bodies = self._placed_bodies()
+        return bodies.distances(bodies.from_obstacles)
+
+    def self_distances(self) -> list[Array]:
+        """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
+        bodies = self._placed_bodies()
+        return bodies.distances(bodies.among_links)
+
+    def arm_points(self) -> Array:
+        """Compute points of the arm of which one moves as far as any point of it, or further [m], shape (P, 3, K).
+
+        They are the ends of the skeleton's segments, or corners of boxes that hold the links.
+        """
+        if self._bodies is not None:
+            return self._placed_bodies().corners()
+        segments = self.segments()
+        return segments.reshape(-1, *segments.shape[2:])
+
+    def _placed_bodies(self) -> Bodies:
+        """Return the robot's shape where the robot is."""
+        if self._bodies is None:
+            raise RecipeError([NO_SHAPE])
+        if not self._placed:
+            n = self.robot.n
+            rotations, positions = trace(self._model, self._data, self.q, list(range(n + 1)), n_turned=n + 1)
+            self._bodies.place(rotations, positions, self._tops)
+            self._placed = True
+        return self._bodies
 
     def object_distances(self) -> list[Array]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.

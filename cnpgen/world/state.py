@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.world.bodies import NO_SHAPE, Bodies
 from cnpgen.world.scene import Scene
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class World:
         self._tip = robot.tip_frame
         self._object_size = object_size
         self._scene = Scene(obstacles, object_size, len(robot.skeleton))
+        self._bodies = None if robot.shape is None else Bodies(robot.shape, obstacles, robot.n)
         self._skeleton = robot.skeleton
         self._joints = sorted({point for segment in robot.skeleton for point in segment} - {robot.n})
         zero = np.zeros(robot.n)
@@ -68,6 +70,7 @@ class World:
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
         self._scene.set_tops(tops.tolist())
+        self._tops, self._placed = tops, False
         self._distances: list[float] | None = None
 
     @property
@@ -142,6 +145,33 @@ class World:
             points[self.robot.n] = self._T_world_tip.translation.tolist()
             self._distances = self._scene.segment_distances([(points[a], points[b]) for a, b in self._skeleton])
         return self._distances
+
+    def shape_distances(self) -> list[float]:
+        """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
+
+        The smallest is exact, the others are lower bounds above it (``cnpgen.world.sweep.sweep``).
+
+        Raises:
+            RecipeError: The robot has no shape.
+        """
+        bodies = self._placed_bodies()
+        return [float(each[0]) for each in bodies.distances(bodies.from_obstacles)]
+
+    def self_distances(self) -> list[float]:
+        """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
+        bodies = self._placed_bodies()
+        return [float(each[0]) for each in bodies.distances(bodies.among_links)]
+
+    def _placed_bodies(self) -> Bodies:
+        """Return the robot's shape where the robot is."""
+        if self._bodies is None:
+            raise RecipeError([NO_SHAPE])
+        if not self._placed:
+            poses = list(self._data.oMi)
+            rotations = np.array([pose.rotation for pose in poses])[..., None]
+            self._bodies.place(rotations, np.array([pose.translation for pose in poses])[..., None], self._tops)
+            self._placed = True
+        return self._bodies
 
     def object_distances(self) -> list[float]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.

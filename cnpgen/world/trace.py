@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def trace(model: "pin.Model", data: "pin.Data", q: Array, joints: list[int]) -> tuple[Array, Array]:
+def trace(
+    model: "pin.Model", data: "pin.Data", q: Array, joints: list[int], *, n_turned: int = 1
+) -> tuple[Array, Array]:
     """Run the forward kinematics of K states.
 
     Poses are read through arrays that share Pinocchio's memory, as bytes: that takes as long as the kinematics
@@ -24,10 +26,11 @@ def trace(model: "pin.Model", data: "pin.Data", q: Array, joints: list[int]) -> 
         data: Its memory.
         q: Joint positions [rad], shape (n, K).
         joints: The joints that are wanted.
+        n_turned: Of how many of them, the first ones, the rotations are wanted.
 
     Returns:
-        ``(rotation, positions)``: rotation matrices of the first of the joints in the world frame, shape (3, 3, K), and
-        positions of all of them [m], shape (joints, 3, K).
+        ``(rotations, positions)``: rotation matrices in the world frame, shape (n_turned, 3, 3, K), and positions of
+        all joints [m], shape (joints, 3, K).
 
     Raises:
         MachineError: Pinocchio's arrays are copies.
@@ -35,7 +38,7 @@ def trace(model: "pin.Model", data: "pin.Data", q: Array, joints: list[int]) -> 
     import pinocchio as pin
 
     move, poses = pin.forwardKinematics, [data.oMi[joint] for joint in joints]
-    shared = [poses[0].rotation, *(pose.translation for pose in poses)]
+    shared = [*(pose.rotation for pose in poses[:n_turned]), *(pose.translation for pose in poses)]
     read, found = [array.tobytes for array in shared], []
     for state in np.ascontiguousarray(q.T):
         move(model, data, state)
@@ -44,4 +47,5 @@ def trace(model: "pin.Model", data: "pin.Data", q: Array, joints: list[int]) -> 
     if not np.array_equal(shared[0], poses[0].rotation, equal_nan=True):
         raise MachineError("Pinocchio's arrays are copies of its memory: leave eigenpy.sharedMemory(True) as it is")
     numbers = np.frombuffer(b"".join(found)).reshape(q.shape[1], -1, 3).transpose(1, 2, 0).copy()
-    return numbers[:3], numbers[3:]
+    turned = 3 * n_turned
+    return numbers[:turned].reshape(n_turned, 3, 3, -1), numbers[turned:]

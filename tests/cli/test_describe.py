@@ -26,6 +26,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
+from tests.examples.shaped_robot import write_problem
 
 KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
 
@@ -97,6 +98,20 @@ def test_an_object_and_obstacles_are_described():
 def test_the_objective_is_described():
     assert "objective  shortest time, and centrifugal 0.01 s^2/m" in describe(load_problem("airhockey"))
     assert re.search(r"objective +shortest time\n", describe(load_problem("heavy-object")))
+
+
+def test_the_links_of_a_shape_and_their_pairs_are_listed(tmp_path):
+    problem = load_problem(write_problem(tmp_path))
+    lines = describe(problem).splitlines()
+    assert re.search(r"turret +1 +128 +[\d.]+ +99\.\d +29\.\d +1$", next(line for line in lines if " turret " in line))
+    hand = next(line for line in lines if line.startswith("    base ") and " hand " in line)
+    assert re.search(r"3\.\d\d% +[45]\.\d\d% +judges and solvers$", hand)
+    assert any(re.search(r"arm +fore +not looked at: joined by a joint", line) for line in lines)
+    content = json.loads(json.dumps(plain(recipe_to_dict(problem))))["shape"]
+    turret = next(link for link in content["links"] if link["link"] == "turret")
+    assert (turret["joint"], turret["pieces"], round(turret["overhang"], 3)) == (1, 1, 0.029)
+    assert len(content["pairs"]) == 14
+    assert "shape" not in recipe_to_dict(load_problem("heavy-object"))
 
 
 @pytest.mark.parametrize("kind", ["problem", "pipeline", "dataset"])

@@ -6,9 +6,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cnpgen.pipelines.acceptance import _unmet, acceptance
+from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.undecided import unmet
+from cnpgen.problems.constraints.constraint import Condition
 from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
@@ -122,10 +124,11 @@ def test_a_number_that_is_none_is_never_accepted_wherever_it_is(prepare: Prepare
 @pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (-1.0, np.inf), (-1.0, 1.0)])
 def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
     x = ca.SX.sym("x")
-    unmet = ca.Function("unmet", [x], [_unmet([x], np.array([lower]), np.array([upper]), np.array([0.5]))])
-    assert [float(unmet(value)) for value in (0.0, 1.4, -1.4)] == [0.0, 0.0, 0.0]
-    assert float(unmet(np.nan)) > 0
-    assert [float(unmet(value)) > 0 for value in (1.6, -1.6)] == [bool(upper < 1.6), bool(lower > -1.6)]
+    condition = Condition("x", "m", [x], np.array([lower]), np.array([upper]), "position")
+    count = ca.Function("unmet", [x], [unmet(condition, np.array([1e-6]))])
+    assert [float(count(value)) for value in (0.0, 1 + 9e-7, -1 - 9e-7)] == [0.0, 0.0, 0.0]
+    assert float(count(np.nan)) > 0
+    assert [float(count(value)) > 0 for value in (1.6, -1.6)] == [bool(upper < 1.6), bool(lower > -1.6)]
 
 
 def test_torques_beyond_their_limits_are_rejected(prepare: Prepare, rounds):

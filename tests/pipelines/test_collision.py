@@ -122,6 +122,18 @@ def test_arms_in_collision_are_rejected_under_the_end_s_name(heavy):
     assert fates["collision (Coal)"] == 0
 
 
+def test_a_distance_that_is_asked_for_is_kept_beside_the_radius(heavy, prepare: Prepare):
+    constraints = heavy.context.problem.constraint
+    further = [replace(each, distance=5e-3) if isinstance(each, RobotClearance) else each for each in constraints]
+    problem = replace(heavy.context.problem, constraint=tuple(further))
+    context = replace(heavy.context, problem=problem)
+    draws = run_stages(heavy, 1500, seed=96, until="Collision")
+    before = draws["start_clearance"][0]
+    Collision(end="start", judge="segments").prepare(context)(draws, random_generator(0, "train", 0))
+    assert 0 < len(draws.alive) < len(before)
+    np.testing.assert_array_equal(draws["start_clearance"][0], before[before > 5e-3])
+
+
 def test_coal_alone_rejects_what_the_segments_reject(heavy):
     stages = heavy.pipeline.stage
     until_start = run_stages(heavy, 1500, seed=95, until="StartIK")

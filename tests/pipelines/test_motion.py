@@ -8,8 +8,15 @@ import pytest
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.motion import TableAcceleration, TableVelocity, table_acceleration, table_velocity
+from cnpgen.pipelines.stages.motion import (
+    AtRest,
+    TableAcceleration,
+    TableVelocity,
+    table_acceleration,
+    table_velocity,
+)
 from cnpgen.pipelines.stages.stage import Round
+from cnpgen.problems.problem import resolved
 from tests.conftest import Arm, Prepare, run_stages
 
 EXACT = 1e-9  # m/s and m/s^2
@@ -151,3 +158,19 @@ def test_all_starts_may_be_at_rest(prepare: Prepare):
     draws = run_stages(prepared, 100, until="StartIK")
     TableVelocity(at_rest=1.0).prepare(prepared.context)(draws, random_generator(1, "train", 0))
     np.testing.assert_array_equal(draws["start_dq"], 0.0)
+
+
+@pytest.mark.parametrize(("end", "acceleration", "stored"), [("goal", "free", False), ("goal", "zero", True)])
+def test_a_goal_at_rest_may_prescribe_an_acceleration_of_zero(prepare: Prepare, end, acceleration, stored):
+    prepared = prepare("heavy-object")
+    stage = AtRest(end=end, acceleration=acceleration)
+    assert [field.name for field in stage.provides(prepared.context)] == ["goal_dq"] + ["goal_ddq"] * stored
+    draws = Round(5)
+    stage.prepare(prepared.context)(draws, random_generator(1, "train", 0))
+    np.testing.assert_array_equal(draws["goal_ddq"], np.zeros((7, 5)))
+    assert ("must end with" in stage.describe()) == stored
+
+
+def test_recipes_that_do_not_prescribe_it_are_written_as_before():
+    assert "acceleration" not in resolved(AtRest(end="goal"))
+    assert resolved(AtRest(end="goal", acceleration="zero"))["acceleration"] == "zero"

@@ -23,7 +23,7 @@ from tests.examples.constraints import TipSpeed
 from tests.examples.models import untrained_model
 
 SHIPPED = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
-LABELS = {"title", "robot.urdf"}  # what a problem is called and where its URDF lies: the URDF's content counts
+LABELS = {"title", "robot.urdf", "robot.srdf"}  # what it is called and where files lie: what is in them counts
 
 
 PROBLEMS = {

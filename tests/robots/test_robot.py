@@ -129,7 +129,7 @@ def test_base_on_its_limit_is_inside():
         (
             'name="joint_3" type="revolute"',
             'name="joint_3" type="continuous"',
-            "'joint_3' is a continuous joint, which has no limits (make it revolute, with limits)",
+            "'joint_3' is a continuous joint, which has no limits (give ranges to all joints: 'position' in [limits])",
         ),
         (
             'name="joint_3" type="revolute"',

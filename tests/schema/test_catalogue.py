@@ -204,7 +204,7 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
         ),
         ('"a", "b"]', '"a", "bee"]', "robot.joints: arm.urdf has no joint 'bee' that moves"),
         ('"a", "b"]', '"a", "grip"]', "robot.joints: arm.urdf has no joint 'grip' that moves"),
-        ('tip = "hand"', 'tip = "hnd"', "robot.tip: arm.urdf has no frame 'hnd' (did you mean 'hand'?)"),
+        ('tip = "hand"', 'tip = "hnd"', "robot.tip: arm.urdf has no frame 'hnd' (did you mean 'hand'?); its frames: "),
         ('urdf = "arm.urdf"', 'urdf = "arm"', "robot.urdf: no such file: "),
     ],
 )

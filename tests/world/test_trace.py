@@ -17,10 +17,11 @@ def test_poses_are_those_of_every_single_state(name: str) -> None:
     model, data, other = robot.model, robot.model.createData(), robot.model.createData()
     q = np.random.default_rng(0).uniform(-2, 2, (robot.n, 40))
     joints = [robot.n, 1, 4]
-    rotation, positions = trace(model, data, q, joints)
+    rotations, positions = trace(model, data, q, joints, n_turned=2)
     for k, state in enumerate(q.T):
         pin.forwardKinematics(model, other, state.copy())
-        np.testing.assert_array_equal(rotation[..., k], other.oMi[joints[0]].rotation)
+        for joint, rotation in zip(joints, rotations, strict=False):
+            np.testing.assert_array_equal(rotation[..., k], other.oMi[joint].rotation)
         for joint, position in zip(joints, positions, strict=True):
             np.testing.assert_array_equal(position[:, k], other.oMi[joint].translation)
 

@@ -16,6 +16,7 @@ from cnpgen.judges.plans.survey import Survey
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -28,7 +29,7 @@ BOWED = 1.01  # times the straight line between two moments: no way is longer
 
 def is_contact(constraint: Constraint) -> bool:
     """Whether a constraint is about distances of bodies, which have kinks where other points become the nearest."""
-    return isinstance(constraint, ObjectContact | RobotClearance)
+    return isinstance(constraint, ObjectContact | RobotClearance | SelfClearance)
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Intervals:
     Attributes:
         s: Phases of both ends, shape (I, 2).
         room: Distances less the smallest that is called valid [m], shape (M, I, 2).
-        ways: How far a point of the bodies moves at most from end to end [m], shape (I,).
+        ways: How far points of the two bodies of a pair move at most against each other [m], shape (I,).
     """
 
     s: Array
@@ -90,14 +91,9 @@ def _divisions(survey: Survey, intervals: Intervals, constraint: Constraint) -> 
 def _intervals(world: PathWorld, s: Array, contacts: Measured) -> Intervals:
     """Return the intervals between neighbours in rows of phases s, shape (rows, K), at all of which the world is."""
     room = contacts.g - (contacts.condition.lower - contacts.allowed)[:, None]
-    points = world.object_corners() if isinstance(contacts.constraint, ObjectContact) else _ends(world)
+    points = world.object_corners() if isinstance(contacts.constraint, ObjectContact) else world.arm_points()
     room, points = room.reshape(-1, *s.shape), points.reshape(-1, 3, *s.shape)
     ways = np.sqrt(np.square(np.diff(points, axis=3)).sum(axis=1)).max(axis=0)
+    ways = 2 * ways if isinstance(contacts.constraint, SelfClearance) else ways  # both links move
     ends = [np.stack([values[..., :-1], values[..., 1:]], axis=-1) for values in (s, room)]
     return Intervals(ends[0].reshape(-1, 2), ends[1].reshape(len(room), -1, 2), ways.ravel())
-
-
-def _ends(world: PathWorld) -> Array:
-    """Return both ends of every segment of the arm [m], shape (P, 3, K)."""
-    segments = world.segments()
-    return segments.reshape(-1, *segments.shape[2:])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.course import Course
 from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
-from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.problem import Problem
@@ -162,10 +162,6 @@ def name_part(problem: Problem, constraint: Constraint, condition: Condition, pa
         return problem.robot.joints[part]
     if condition.parts:
         return condition.parts[part]
-    obstacles = [obstacle.name for obstacle in problem.obstacle]
     if isinstance(constraint, ObjectContact):
-        return obstacles[part]
-    if isinstance(constraint, RobotClearance):  # segment by segment
-        segment, obstacle = divmod(part, len(obstacles))
-        return f"segment {segment + 1}, {obstacles[obstacle]}"
+        return problem.obstacle[part].name
     return f"[{part}]"

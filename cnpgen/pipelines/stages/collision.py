@@ -3,9 +3,12 @@
 An exact test of every capsule's segment against every box comes first and rejects almost all collisions cheaply; Coal
 then judges every sample that is left. The boxes move with the sample, so each becomes a sliding joint of the
 Pinocchio model: one call checks a whole round without any Python per sample.
+
+A robot with a shape is covered by its capsules: samples whose capsules are clear are kept, of all others Coal decides
+with the convex pieces of the links.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +20,8 @@ from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.shape.hull import coal_hull
+from cnpgen.robots.shape.shape import Shape
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.boxes import segment_box_distance
@@ -48,28 +53,53 @@ class Collision(Stage):
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The clearance, where the segment test computes it."""
-        del context
-        if self.judge == "coal":
+        if self.judge == "coal" or context.robot.shape is not None:
             return ()
         text = "distance of the arm's skeleton from the nearest obstacle at the {}, less the capsules' radius"
         return tuple(Field(f"{end}_clearance", "m", text.format(end), role="diagnostic") for end in self._ends())
 
     def prepare(self, context: Context) -> Work:
         """Load the kernel or build the geometry."""
-        radius = context.constraint(RobotClearance).radius
-        return self._by_coal(context, radius) if self.judge == "coal" else self._by_segments(context, radius)
+        clearance = context.constraint(RobotClearance)
+        if context.robot.shape is not None:
+            return self._by_pieces(context, clearance.distance)
+        radius = clearance.radius or 0.0
+        if self.judge == "coal":
+            return self._by_coal(context, radius + clearance.distance)
+        return self._by_segments(context, radius, clearance.distance)
 
     def _ends(self) -> tuple[str, ...]:
         return ("start", "goal") if self.end == "both" else (self.end,)
 
-    def _by_segments(self, context: Context, radius: float) -> Work:
+    def _by_segments(self, context: Context, radius: float, least: float) -> Work:
         kernel = context.kernels.load(skeleton_distance)
 
         def work(draws: Round, _random: np.random.Generator) -> None:
             for end in self._ends():
                 (distance,) = kernel(draws[f"{end}_q"], sample_tops(context.problem, draws))
                 draws[f"{end}_clearance"] = distance - radius
-                draws.reject(distance[0] > radius, f"arm in collision at the {end}")
+                draws.reject(distance[0] > radius + least, f"arm in collision at the {end}")
+
+        return work
+
+    def _by_pieces(self, context: Context, distance: float) -> Work:
+        kernel = context.kernels.load(capsule_clearance)
+        with_object = self.judge == "coal"
+        depth = context.constraint(ObjectContact).depth if with_object else 0.0
+        problem = context.problem if with_object else replace(context.problem, object=None)
+        judge = coal_judge(problem, context.robot, distance, depth)
+
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            for end in self._ends():
+                q, tops = draws[f"{end}_q"], sample_tops(context.problem, draws)
+                doubtful = np.ones(q.shape[1], bool)
+                if not with_object:
+                    (clearance,) = kernel(q, tops)
+                    doubtful = ~(clearance[0] > distance)
+                hit = np.zeros(q.shape[1], bool)
+                if doubtful.any():
+                    hit[doubtful] = judge(q[:, doubtful], tops[:, doubtful])
+                draws.reject(~hit, f"arm in collision at the {end}")
 
         return work
 
@@ -106,18 +136,34 @@ def skeleton_distance(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("skeleton_distance", [q_sx, tops_sx], [nearest])
 
 
+def capsule_clearance(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, tops) -> smallest distance of a link's capsule from an obstacle`` [m], minus the radius at most."""
+    import casadi as ca
+
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    zero = [0.0] * robot.n
+    state = SymbolicState(robot, q, zero, zero, tops, problem.obstacle, None)
+    moving = robot.shape.moving_capsules if robot.shape else ()
+    nearest = ca.SX(np.inf)
+    for first, second, radius in (state.capsules[capsule.link] for capsule in moving):
+        for box in state.boxes:
+            nearest = ca.fmin(nearest, segment_box_distance(first, second, box) - radius)
+    return ca.Function("capsule_clearance", [q_sx, tops_sx], [nearest])
+
+
 def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) -> Any:
     """Return a function ``(q (n, N), tops (obstacles, N)) -> collides (N,)`` that asks Coal.
 
-    The held object is made smaller by ``depth`` on every side: the contact that is legal does not count, and the
-    touching pair, the slowest case of Coal's algorithms, becomes a clear one.
+    The arm is capsules of the radius, or the pieces of its shape, thicker by the radius. The held object is made
+    smaller by ``depth`` on every side: the contact that is legal does not count, and the touching pair, the slowest
+    case of Coal's algorithms, becomes a clear one.
     """
     import coal
     import pinocchio as pin
 
     model = robot.model.copy()
     geometry = pin.GeometryModel()
-    moving = _add_capsules(geometry, robot, radius)
+    moving = _add_pieces(geometry, robot.shape, radius) if robot.shape else _add_capsules(geometry, robot, radius)
     if problem.object is not None:
         size = np.array(problem.object.size) - 2 * depth
         frame = model.frames[robot.tip_frame]
@@ -139,6 +185,19 @@ def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) ->
         return np.asarray(pin.computeCollisionsInParallel(1, pool, states, True)).astype(bool)
 
     return judge
+
+
+def _add_pieces(geometry: Any, shape: Shape, distance: float) -> list[int]:
+    """Add the pieces of a robot's shape that move, thicker by a distance [m]."""
+    import pinocchio as pin
+
+    added: list[int] = []
+    for piece in shape.moving_pieces:
+        hull, name = coal_hull(piece.vertices), f"{piece.link}_{len(added)}"
+        hull.setSweptSphereRadius(piece.radius + distance)
+        solid = pin.GeometryObject(name, shape.joints[piece.link], 0, pin.SE3.Identity(), hull)
+        added.append(geometry.addGeometryObject(solid))
+    return added
 
 
 def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:

@@ -30,18 +30,26 @@ def _motion_fields(context: Context, end: str) -> tuple[Field, Field]:
 
 @dataclass(frozen=True, kw_only=True)
 class AtRest(Stage):
-    """Velocity and acceleration zero at one end; the goal's acceleration is not stored."""
+    """Velocity and acceleration zero at one end; motions need not end with the acceleration, unless it is asked for."""
 
     end: str = field("which end is at rest", choices=("start", "goal"))
+    acceleration: str = field(
+        'whether motions must end with an acceleration of "zero", which is stored then, or are "free" to stop with any;'
+        " they always start with zero",
+        choices=("free", "zero"),
+        default="free",
+        late=True,
+    )
 
     def describe(self) -> str:
         """Say which end."""
-        return f"set velocity and acceleration of the {self.end} to zero"
+        kept = ", which motions must end with" if self.end == "goal" and self.acceleration == "zero" else ""
+        return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
-        """Velocity, and for the start the acceleration."""
+        """Velocity, and acceleration where it is prescribed."""
         fields = _motion_fields(context, self.end)
-        return fields if self.end == "start" else fields[:1]
+        return fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
 
     def writes(self, context: Context) -> tuple[str, ...]:
         """Also the goal's acceleration, for the checks."""

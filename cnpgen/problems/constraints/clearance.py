@@ -1,6 +1,6 @@
-"""Collision avoidance: the robot's capsules keep clear of the obstacles, the held object does not enter them."""
+"""Collision avoidance: the robot keeps clear of the obstacles, the held object does not enter them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,34 +15,71 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotClearance(Constraint):
-    """Capsules along the chain (paper, Appendix B, robot collision) are further than their radius from every obstacle.
+    """The robot is further than ``distance`` from every obstacle.
 
-    The paper's points, no further than 10 cm apart, have gaps between them; capsules have none.
+    With the paper's geometry the robot is capsules along the chain (Appendix B, robot collision); the paper's points,
+    no further than 10 cm apart, have gaps between them, capsules have none. With its URDF's geometry it is the convex
+    pieces of its links, on which ends and motions are judged; solvers keep the links' capsules clear, which is more
+    than is asked for.
     """
 
     reason = "robot in collision"
-    radius: float = field("radius of the capsules", unit="m", low=1e-6)
+    radius: float | None = field(
+        'radius of the paper\'s capsules, with geometry = "paper-capsules" only', unit="m", low=1e-6, default=None
+    )
+    distance: float = field("how far the robot must be from obstacles", unit="m", low=0.0, default=0.0, late=True)
     tolerance: float = field("how deep a motion may enter and still be called valid", unit="m", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the signed distance of every moving segment from every obstacle [m]."""
+        """State the signed distance of every moving segment, or capsule's axis, from every obstacle [m]."""
         from cnpgen.symbolic.boxes import segment_box_separation
 
-        return self._clear([segment_box_separation(a, b, box) for a, b in state.segments for box in state.boxes])
+        segments, radii = self._capsules(state)
+        distances = [segment_box_separation(a, b, box) for a, b in segments for box in state.boxes]
+        return self._clear(distances, radii, sufficient=state.robot.shape is not None)
 
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State distances that are easier to descend: inside, the depth of the middle of what is inside [m]."""
         from cnpgen.symbolic.boxes import signed_segment_box_distance as distance
 
-        return self._clear([distance(a, b, box, hold=state.hold) for a, b in state.segments for box in state.boxes])
+        segments, radii = self._capsules(state)
+        distances = [distance(a, b, box, hold=state.hold) for a, b in segments for box in state.boxes]
+        return self._clear(distances, radii, sufficient=state.robot.shape is not None)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
-        return self._clear(world.segment_distances())
+        shape = world.robot.shape
+        if shape is None:
+            (found,) = self._clear(world.segment_distances(), [self.radius or 0.0])
+            bodies = [f"segment {number}" for number, _ in enumerate(world.robot.skeleton, 1)]
+        else:
+            (found,) = self._clear(world.shape_distances(), [0.0])
+            bodies = [piece.link for piece in shape.moving_pieces]
+        return (replace(found, parts=tuple(f"{body}, {box.name}" for body in bodies for box in world.obstacles)),)
 
-    def _clear(self, distances: list[Any]) -> tuple[Condition, ...]:
+    def solved(self, world: "World") -> tuple[Condition, ...]:
+        """Return the conditions of the capsules."""
+        shape = world.robot.shape
+        if shape is None:
+            return self.measured(world)
+        radii = [capsule.radius for capsule in shape.moving_capsules]
+        return self._clear([0.0] * (len(radii) * len(world.obstacles)), radii, sufficient=True)
+
+    def _capsules(self, state: "SymbolicState") -> tuple[list[Any], list[float]]:
+        """Both ends of the axes of all moving capsules, and their radii [m]."""
+        shape = state.robot.shape
+        if shape is None:
+            return state.segments, [self.radius or 0.0] * len(state.segments)
+        moving = [state.capsules[capsule.link] for capsule in shape.moving_capsules]
+        return [(first, second) for first, second, _ in moving], [radius for *_, radius in moving]
+
+    def _clear(self, distances: list[Any], radii: list[float], *, sufficient: bool = False) -> tuple[Condition, ...]:
+        """State that distances, capsule by capsule, are no smaller than the radii and ``distance``."""
         m = len(distances)
-        return (Condition("robot clearance", "m", distances, np.full(m, self.radius), np.full(m, np.inf), "position"),)
+        least = np.repeat(radii, m // max(len(radii), 1)) + self.distance
+        return (
+            Condition("robot clearance", "m", distances, least, np.full(m, np.inf), "position", sufficient=sufficient),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,6 +49,7 @@ class Condition:
         upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
         exactness: Key of ``EXACTNESS``: how exactly a boundary state must meet it.
         parts: Names of the values, m of them, or none: they are numbered then.
+        sufficient: Whether it asks for more than is meant: only the measured form tells what does not meet it.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Condition:
     upper: NDArray[np.float64]
     exactness: str
     parts: tuple[str, ...] = ()
+    sufficient: bool = False
 
     @property
     def is_equality(self) -> bool:
@@ -146,6 +148,13 @@ class Constraint(ABC):
         ``sum()`` over a vector. Every entry of a condition's ``g`` is then a float or an array of shape (K,); bounds do
         not depend on the state.
         """
+
+    def solved(self, world: "World") -> tuple[Condition, ...]:
+        """Return the conditions of ``symbolic`` with numbers in the place of expressions; solvers read bounds off them.
+
+        By default ``measured``; overridden where the two forms state different conditions.
+        """
+        return self.measured(world)
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State what a boundary state must meet; by default what every state must."""

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 ENDS = (0, 1, 2, 4, 7, 11)  # grid points from either end where accelerations leap with the last rate control points
 EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exceed within the tolerances
 NEGLIGIBLE = 1e-5  # of scaled residuals: iterations end with larger violations than that
+UNTOLD = 1e9  # so many scaled units are allowed where only the verdict can tell
 SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
 
 
@@ -80,22 +81,21 @@ class BoundsTemplate:
 
     Attributes:
         conditions: The conditions whose values the residuals are.
-        allowed: What the verdict allows residuals to exceed, in scaled units, shape (m,).
+        allowed: What the verdict allows residuals to exceed, in scaled units, shape (m,); ``UNTOLD`` of conditions that
+            ask for more than is meant, of which the verdict knows nothing.
         needs: The highest derivative of q that each residual depends on, shape (m,).
     """
 
     def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
-        pairs = [
-            (constraint, condition) for constraint in problem.constraint for condition in constraint.measured(world)
-        ]
-        needs = measured_needs([constraint.measured for constraint in problem.constraint], world)
+        pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
+        needs = measured_needs([constraint.solved for constraint in problem.constraint], world)
         tables = [_bounds(*pair, s, tightening, need) for pair, need in zip(pairs, needs, strict=True)]
         self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._funnels = list(_funnels(pairs))
         self.conditions = [condition for _, condition in pairs]
-        self.allowed = np.concatenate([each.allowed(condition) / _scale(each, condition) for each, condition in pairs])
+        self.allowed = np.concatenate([_allowed(*pair) for pair in pairs])
         self.needs = np.repeat(needs, [len(each.g) for each in self.conditions])
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
         self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs == 2
@@ -149,6 +149,12 @@ def _funnels(pairs: list[tuple[Constraint, Condition]]) -> Iterator[tuple[Constr
 
 def _scale(constraint: Constraint, condition: Condition) -> Array:
     return residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
+
+
+def _allowed(constraint: Constraint, condition: Condition) -> Array:
+    if condition.sufficient:
+        return np.full(len(condition.g), UNTOLD)
+    return constraint.allowed(condition) / _scale(constraint, condition)
 
 
 def _bounds(

@@ -1,0 +1,67 @@
+"""The shape of a robot in words and numbers: its links with their capsules, and its pairs of links."""
+
+import math
+from typing import Any
+
+from cnpgen.robots.shape.pairs import LinkPair
+from cnpgen.robots.shape.shape import Shape
+
+_LEFT_OUT = {
+    "adjacent": "not looked at: joined by a joint",
+    "always": "not looked at: always in contact",
+    "disabled": "not looked at: disabled by the SRDF",
+}
+
+
+def link_rows(shape: Shape) -> list[tuple[str, ...]]:
+    """List the links: how many pieces and corners, and the capsule that covers them."""
+    head = ("link", "pieces", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "moved by joint")
+    rows: list[tuple[str, ...]] = [head]
+    for capsule in shape.capsules:
+        pieces = [piece for piece in shape.pieces if piece.link == capsule.link]
+        corners, length = sum(len(piece.vertices) for piece in pieces), math.dist(capsule.first, capsule.second)
+        lengths = (f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang))
+        joint = shape.joints[capsule.link]
+        rows.append((capsule.link, str(len(pieces)), str(corners), *lengths, str(joint) if joint else "none"))
+    return rows
+
+
+def pair_rows(shape: Shape) -> list[tuple[str, ...]]:
+    """List the pairs of links: in how many random states they collide, and who looks at them."""
+    head = ("links", "", "colliding", "capsules mistaken", "kept apart by")
+    return [head, *((pair.first, pair.second, *_shares(pair), _use(pair)) for pair in shape.pairs)]
+
+
+def _shares(pair: LinkPair) -> tuple[str, str]:
+    return ("", "") if math.isnan(pair.colliding) else (f"{pair.colliding:.2%}", f"{pair.mistaken:.2%}")
+
+
+def _use(pair: LinkPair) -> str:
+    if pair.left_out:
+        return _LEFT_OUT[pair.left_out]
+    return "judges and solvers" if pair.for_solvers else "judges"
+
+
+def shape_to_dict(shape: Shape) -> dict[str, Any]:
+    """Return links and pairs for JSON, in SI units."""
+    capsules = [
+        {
+            "link": each.link,
+            "joint": shape.joints[each.link],
+            "pieces": sum(piece.link == each.link for piece in shape.pieces),
+            "capsule": {"first": each.first.tolist(), "second": each.second.tolist(), "radius": each.radius},
+            "overhang": each.overhang,
+        }
+        for each in shape.capsules
+    ]
+    pairs = [
+        {
+            "links": [pair.first, pair.second],
+            "left_out": pair.left_out,
+            "colliding": None if math.isnan(pair.colliding) else pair.colliding,
+            "mistaken": None if math.isnan(pair.mistaken) else pair.mistaken,
+            "for_solvers": pair.for_solvers,
+        }
+        for pair in shape.pairs
+    ]
+    return {"links": capsules, "pairs": pairs}

@@ -1,0 +1,78 @@
+"""Self-collision: links of the robot that joints move against each other do not touch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.schema.keys import field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+    from cnpgen.robots.shape.pairs import LinkPair
+    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.world.state import World
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfClearance(Constraint):
+    """Two links of a pair that is not left out are further than ``distance`` from each other.
+
+    It needs the geometry of the URDF. Judges measure the links' convex pieces. Solvers keep the capsules of those pairs
+    apart whose capsules hardly ever overlap where the links do not; of the others only judges know.
+    """
+
+    reason = "robot in collision with itself"
+    distance: float = field("how far links must be from each other", unit="m", low=0.0, default=0.0)
+    tolerance: float = field("how deep links may enter each other in a valid motion", unit="m", low=0.0)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the distances of the capsules' axes [m] of the pairs that are for solvers."""
+        return self._apart(state, _for_solvers(state.robot))
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Measure the signed distances of the links' pieces with Coal [m]."""
+        (found,) = self._least(world.self_distances(), [0.0], sufficient=False)
+        shape = world.robot.shape
+        links = [piece.link for piece in shape.pieces] if shape else []
+        pairs = shape.apart if shape else ()
+        return (replace(found, parts=tuple(f"{links[i]}, {links[j]}" for i, j in pairs)),)
+
+    def solved(self, world: "World") -> tuple[Condition, ...]:
+        """Return the conditions of the capsules."""
+        radii = _radii(world.robot, _for_solvers(world.robot))
+        return self._least([0.0] * len(radii), radii, sufficient=True)
+
+    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """State the distances of all pairs."""
+        return self._apart(state, _looked_at(state.robot))
+
+    def _apart(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
+        from cnpgen.symbolic.segments import segment_distance
+
+        ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
+        distances = [segment_distance((a, b), (c, d)) for (a, b, _), (c, d, _) in ends]
+        return self._least(distances, _radii(state.robot, pairs), sufficient=True)
+
+    def _least(self, distances: list[Any], radii: list[float], *, sufficient: bool) -> tuple[Condition, ...]:
+        m = len(distances)
+        least, most = np.zeros(m) + (radii if m else 0.0) + self.distance, np.full(m, np.inf)
+        return (Condition("self clearance", "m", distances, least, most, "position", sufficient=sufficient),)
+
+
+def _looked_at(robot: "Robot") -> "list[LinkPair]":
+    """List the pairs of links that must not touch."""
+    return [pair for pair in robot.shape.pairs if not pair.left_out] if robot.shape else []
+
+
+def _for_solvers(robot: "Robot") -> "list[LinkPair]":
+    """List those of them whose capsules solvers keep apart."""
+    return [pair for pair in _looked_at(robot) if pair.for_solvers]
+
+
+def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> list[float]:
+    """Sums of the radii of the capsules of pairs [m]."""
+    radius = {capsule.link: capsule.radius for capsule in robot.shape.capsules} if robot.shape else {}
+    return [radius[pair.first] + radius[pair.second] for pair in pairs]

@@ -1,0 +1,97 @@
+"""Which shape the robot of a problem has, and what in a problem file does not go with it; on the raw tables."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from cnpgen.errors import RecipeError
+from cnpgen.problems.checks import tables
+from cnpgen.robots.shape.files import find_named_file
+from cnpgen.robots.urdf import read_urdf, urdf_tree
+from cnpgen.schema.keys import Place
+
+_NAME_IT = 'name geometry = "paper-capsules" in [robot] for a robot that is a line through its joints\' origins'
+
+
+def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
+    """Say which shape a problem's robot has: what it names, else that of the URDF if there is something to hit.
+
+    Args:
+        table: The problem file.
+        folder: The folder that it is in.
+    """
+    named = _robot(table).get("geometry")
+    if isinstance(named, str):
+        return named
+    something_to_hit = bool(tables(table, "obstacle") or _constraints(table, "self-clearance"))
+    return "urdf" if something_to_hit and _collision_elements(table, folder) else "paper-capsules"
+
+
+def geometry_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
+    """Say what in a problem file does not go with the shape of its robot."""
+    if chosen_geometry(table, folder) != "urdf":
+        yield from _paper_mistakes(table, where)
+        return
+    elements = _collision_elements(table, folder)
+    if not elements:
+        text = "its links have no <collision> elements, so that it has no shape"
+        yield (where / "robot" / "geometry").says(f"the URDF gives no shape: {text}; {_NAME_IT}")
+    for place, constraint in _constraints(table, "robot-clearance"):
+        if "radius" in constraint:
+            text = f"the robot has the shape that its URDF gives it, and no radius: leave it out, or {_NAME_IT}"
+            yield (where / "constraint" / place / "radius").says(text)
+    yield from _missing_files(table, where / "robot", folder, elements)
+
+
+def _paper_mistakes(table: dict[str, Any], where: Place) -> Iterator[str]:
+    for place, constraint in _constraints(table, "robot-clearance"):
+        if "radius" not in constraint:
+            text = 'missing key, expected a length [m]: with geometry = "paper-capsules" the arm is so thick'
+            yield (where / "constraint" / place / "radius").says(text)
+    for place, _ in _constraints(table, "self-clearance"):
+        text = 'links are kept apart by their shapes: it needs geometry = "urdf" in [robot], and <collision> elements'
+        yield (where / "constraint" / place).says(text)
+    if _robot(table).get("srdf"):
+        yield (where / "robot" / "srdf").says('pairs of links matter with geometry = "urdf" only')
+
+
+def _missing_files(
+    table: dict[str, Any], where: Place, folder: Path, elements: list[ElementTree.Element]
+) -> Iterator[str]:
+    robot = _robot(table)
+    named = robot.get("packages", [])
+    packages = [folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
+    for package in packages:
+        if not package.is_dir():
+            yield (where / "packages").says(f"no such folder: {package}")
+    meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
+    for name in meshes:
+        try:
+            find_named_file(name, folder / str(robot["urdf"]), packages)
+        except RecipeError as error:
+            yield (where / "urdf").says(str(error))
+    srdf = robot.get("srdf")
+    if isinstance(srdf, str) and srdf and not (folder / srdf).is_file():
+        yield (where / "srdf").says(f"no such file: {folder / srdf}")
+
+
+def _collision_elements(table: dict[str, Any], folder: Path) -> list[ElementTree.Element]:
+    """List the collision elements of the URDF; none if it cannot be read, which is reported elsewhere."""
+    urdf = _robot(table).get("urdf")
+    if not isinstance(urdf, str):
+        return []
+    try:
+        tree = urdf_tree(read_urdf(folder / urdf))
+    except (RecipeError, ValueError):
+        return []
+    return list(tree.iterfind("link/collision"))
+
+
+def _robot(table: dict[str, Any]) -> dict[str, Any]:
+    robot = table.get("robot")
+    return robot if isinstance(robot, dict) else {}
+
+
+def _constraints(table: dict[str, Any], use: str) -> list[tuple[int, dict[str, Any]]]:
+    return [(place, each) for place, each in tables(table, "constraint") if each.get("use") == use]

@@ -1,0 +1,51 @@
+"""Convex hulls: the corners of one, and one as Coal takes it."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import coal
+
+Array = NDArray[np.float64]
+
+THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
+
+
+def hull_corners(points: Array) -> Array:
+    """Return the corners of the convex hull of points; it is made ``THINNEST`` thick where it is thinner.
+
+    Args:
+        points: The points [m], shape (N, 3).
+
+    Returns:
+        Shape (V, 3), in an order that depends on the coordinates only.
+    """
+    from scipy.spatial import ConvexHull
+
+    points = np.unique(points, axis=0)
+    offsets = points - points.mean(axis=0)
+    for axis in np.linalg.eigh(offsets.T @ offsets)[1].T:
+        if np.ptp(offsets @ axis) < THINNEST:
+            points = np.concatenate([points - THINNEST * axis, points + THINNEST * axis])
+    corners: Array = points[np.sort(ConvexHull(points).vertices)]
+    return corners
+
+
+def coal_hull(corners: Array) -> "coal.Convex":
+    """Return a convex hull as a Coal shape.
+
+    Args:
+        corners: Its corners [m], shape (V, 3); up to three are a point, a segment, a triangle.
+    """
+    import coal
+    from scipy.spatial import ConvexHull
+
+    triangles = ConvexHull(corners).simplices if len(corners) > 3 else [np.arange(3) % len(corners)]
+    points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for corner in corners:
+        points.append(corner)
+    for triangle in triangles:
+        faces.append(coal.Triangle(*map(int, triangle)))
+    return coal.Convex(points, faces)

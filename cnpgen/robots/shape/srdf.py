@@ -1,0 +1,40 @@
+"""Pairs of links that an SRDF disables: written into the text of the URDF, and read from there."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from cnpgen.errors import RecipeError
+from cnpgen.robots.urdf import read_urdf, urdf_tree
+
+_TAG = "disable_collisions"
+
+
+def with_disabled_pairs(urdf: str, srdf: Path) -> str:
+    """Return a URDF with the pairs of links that an SRDF file disables.
+
+    Args:
+        urdf: The text of the URDF; readers of URDFs pass over elements that they do not know.
+        srdf: The SRDF file.
+
+    Raises:
+        RecipeError: The SRDF cannot be read, or names links that the URDF does not have.
+    """
+    try:
+        entries = list(urdf_tree(read_urdf(srdf)).iter(_TAG))
+    except ValueError as error:
+        raise RecipeError([f"{srdf}: not an SRDF that can be read: {error}"]) from error
+    robot = urdf_tree(urdf)
+    links = {link.get("name") for link in robot.iter("link")}
+    named = {entry.get(key) for entry in entries for key in ("link1", "link2")}
+    if unknown := sorted(map(str, named - links)):
+        raise RecipeError([f"{srdf}: the URDF has no link {', '.join(unknown)}"])
+    for entry in entries:
+        robot.append(ElementTree.Element(_TAG, dict(entry.attrib)))
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def disabled_pairs(urdf: str) -> frozenset[frozenset[str]] | None:
+    """Return the pairs of links that are disabled; None if no SRDF was given."""
+    entries = list(urdf_tree(urdf).iter(_TAG))
+    pairs = frozenset(frozenset((entry.get("link1", ""), entry.get("link2", ""))) for entry in entries)
+    return pairs or None

@@ -1,0 +1,36 @@
+"""Distance between two segments, the axes of two capsules, as SX."""
+
+from typing import Any
+
+from cnpgen.symbolic.linalg import Scalar, add, dot, scale, subtract
+from cnpgen.symbolic.state import Vec
+
+POINT = 1e-12  # m^2: the square of the length of a segment that is taken for a point, and what keeps roots smooth
+
+
+def segment_distance(first: tuple[Vec, Vec], second: tuple[Vec, Vec]) -> Scalar:
+    """Distance between two segments [m]; it has a gradient everywhere, and is 1e-6 m where they cross.
+
+    The nearest points of the two lines, one after the other brought into its segment (Ericson 2005, section 5.1.9).
+
+    Args:
+        first: Both ends of one segment [m].
+        second: Both ends of the other one.
+    """
+    import casadi as ca
+
+    one, other = subtract(first[1], first[0]), subtract(second[1], second[0])
+    between = subtract(first[0], second[0])
+    aa, bb, ab = dot(one, one), dot(other, other), dot(one, other)
+    ar, br = dot(one, between), dot(other, between)
+    s = _share((ab * br - ar * bb) / ca.fmax(aa * bb - ab * ab, POINT * POINT))
+    t = _share((ab * s + br) / ca.fmax(bb, POINT))
+    s = _share((ab * t - ar) / ca.fmax(aa, POINT))
+    apart = subtract(add(between, scale(one, s)), scale(other, t))
+    return ca.sqrt(dot(apart, apart) + POINT)
+
+
+def _share(value: Any) -> Any:
+    import casadi as ca
+
+    return ca.fmax(ca.fmin(value, 1), 0)

@@ -1,0 +1,95 @@
+"""Where the robots of the package example-robot-data are, if it is installed; and a Panda between two shelves."""
+
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+
+def folder() -> Path | None:
+    """The folder in which ``package://example-robot-data`` begins."""
+    try:
+        share = Path(str(metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share")))
+    except metadata.PackageNotFoundError:
+        return None
+    return share if (share / "example-robot-data" / "robots").is_dir() else None
+
+
+needs_robots = pytest.mark.skipif(folder() is None, reason="example-robot-data is not installed")
+
+PANDA = """
+name = "panda-shelves"
+[robot]
+urdf = "{share}/example-robot-data/robots/panda_description/urdf/panda.urdf"
+joints = [{joints}]
+tip = "panda_hand_tcp"
+base = "[0, -40, 0, -126, 0, 92, 45] deg"
+{robot}
+[limits]
+acceleration_cap = "10 rad/s^2"
+[[obstacle]]
+name = "table"
+x = "[0.3, 0.9] m"
+y = "[-0.5, 0.5] m"
+top = "0.1 m"
+height = "0.1 m"
+[[obstacle]]
+name = "shelf"
+x = "[0.4, 0.9] m"
+y = "[-0.5, 0.5] m"
+top = "0.75 m"
+height = "0.03 m"
+[[obstacle]]
+name = "post"
+x = "[0.5, 0.6] m"
+y = "[-0.05, 0.05] m"
+top = "0.4 m"
+height = "0.3 m"
+[[constraint]]
+use = "joint-position"
+tolerance = "1e-3 rad"
+[[constraint]]
+use = "joint-velocity"
+tolerance = "0.2 %"
+[[constraint]]
+use = "joint-acceleration"
+tolerance = "0.5 %"
+[[constraint]]
+use = "joint-torque"
+tolerance = "0.5 %"
+[[constraint]]
+use = "robot-clearance"
+tolerance = "0 mm"
+[[constraint]]
+use = "self-clearance"
+tolerance = "0 mm"
+"""
+PANDA_PIPELINE = """
+name = "panda-shelves"
+problem = "problem.toml"
+[[stage]]
+use = "draw-positions"
+start = ["[0.4, 0.7] m", "[-0.4, -0.1] m", "[0.2, 0.6] m"]
+goal = ["[0.4, 0.7] m", "[0.1, 0.4] m", "[0.2, 0.6] m"]
+[[stage]]
+use = "start-ik"
+guess = [
+  "[-60, 60] deg", "[-60, 60] deg", "[-30, 30] deg", "[-150, -60] deg", "[-30, 30] deg", "[60, 140] deg", "[0, 90] deg",
+]
+[[stage]]
+use = "goal-ik"
+[[stage]]
+use = "at-rest"
+end = "start"
+[[stage]]
+use = "at-rest"
+end = "goal"
+"""
+
+
+def write_panda(where: Path, robot: str = "") -> Path:
+    """Write the problem and its pipeline; return the problem file."""
+    joints = ", ".join(f'"panda_joint{number}"' for number in range(1, 8))
+    (where / "problem.toml").write_text(PANDA.format(share=folder(), joints=joints, robot=robot))
+    (where / "pipeline.toml").write_text(PANDA_PIPELINE)
+    return where / "problem.toml"

@@ -1,0 +1,73 @@
+"""An independent look at collisions: Pinocchio and Coal on a URDF's own geometry, its meshes as they are."""
+
+import re
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+from scipy.interpolate import BSpline
+
+from cnpgen.plans import Plans
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+
+
+class Meshes:
+    """A robot as Pinocchio reads it from its file, among the problem's boxes, whose tops stand still.
+
+    Args:
+        problem: The problem, just read from its file.
+        robot: Its robot; of its shape only the pairs are used that nobody looks at.
+        packages: Where ``package://`` begins.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, packages: Path) -> None:
+        beside = f'filename="{problem.urdf_path.parent}/'
+        text = re.sub(r'filename="(?!package:|/)', beside, problem.urdf_path.read_text())
+        full = pin.buildModelFromXML(text)
+        geometry = pin.buildGeomFromUrdfString(full, text, pin.COLLISION, package_dirs=[str(packages)])
+        locked = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
+        self.model, (self.geometry,) = pin.buildReducedModel(full, [geometry], locked, pin.neutral(full))
+        links = list(self.geometry.geometryObjects)
+        for box in problem.obstacle:
+            self._add_box(box, [i for i, each in enumerate(links) if each.parentJoint > 0])
+        self.with_obstacles = len(self.geometry.collisionPairs)
+        names = [self.model.frames[each.parentFrame].name for each in links]
+        left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
+        for i, one in enumerate(links):
+            for j, other in enumerate(links[:i]):
+                if one.parentJoint != other.parentJoint and frozenset((names[i], names[j])) not in left_out:
+                    self.geometry.addCollisionPair(pin.CollisionPair(j, i))
+        self.data, self.results = self.model.createData(), self.geometry.createData()
+        for request in self.results.distanceRequests:
+            request.gjk_tolerance = 1e-9
+
+    def _add_box(self, box, moving: list[int]) -> None:
+        middle = np.array([(box.x.low + box.x.high) / 2, (box.y.low + box.y.high) / 2, box.top - box.height / 2])
+        solid = coal.Box(box.x.high - box.x.low, box.y.high - box.y.low, box.height)
+        index = self.geometry.addGeometryObject(pin.GeometryObject(box.name, 0, pin.SE3(np.eye(3), middle), solid))
+        for each in moving:
+            self.geometry.addCollisionPair(pin.CollisionPair(each, index))
+
+    def distances(self, q: np.ndarray) -> tuple[float, float]:
+        """The smallest distance from obstacles, and between links, at a state [m]."""
+        pin.computeDistances(self.model, self.data, self.geometry, self.results, q)
+        found = [result.min_distance for result in self.results.distanceResults]
+        return min(found[: self.with_obstacles], default=np.inf), min(found[self.with_obstacles :], default=np.inf)
+
+    def touches(self, q: np.ndarray) -> bool:
+        """Whether anything touches at a state."""
+        return bool(pin.computeCollisions(self.model, self.data, self.geometry, self.results, q, True))
+
+
+def states(plans: Plans, index: int, step: float = 1e-3) -> np.ndarray:
+    """Joint positions of a plan at times ``step`` apart [rad], shape (K, n), by SciPy's splines."""
+    path, rate, degree = plans.path_control_points[index], plans.rate_control_points[index], plans.degree
+    p, r = (
+        BSpline(np.concatenate([[0] * degree, np.linspace(0, 1, len(c) - degree + 1), [1] * degree]), c, degree)
+        for c in (path, rate)
+    )
+    s = np.linspace(0, 1, 20001)
+    t = np.concatenate([[0], np.cumsum((1 / r(s[:-1]) + 1 / r(s[1:])) / 2 * np.diff(s))])
+    return np.asarray(p(np.interp(np.arange(0, t[-1], step), t, s)))

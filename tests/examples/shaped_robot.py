@@ -1,0 +1,110 @@
+"""A small arm whose links have shapes of every kind, written to a folder with its meshes and a problem file."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+_LYING = 'rpy="0 1.5707963267948966 0"'  # along x
+_WEDGE = '<mesh filename="package://crane/meshes/wedge.stl" scale="0.001 0.001 0.001"/>'
+LINKS = {  # link -> what its <collision> elements hold
+    "base": ['<origin xyz="0 0 0.05"/><geometry><box size="0.3 0.3 0.1"/></geometry>'],
+    "turret": ['<origin xyz="0 0 0.1"/><geometry><cylinder radius="0.07" length="0.2"/></geometry>'],
+    "arm": [f'<origin xyz="0.2 0 0" {_LYING}/><geometry><capsule radius="0.05" length="0.3"/></geometry>'],
+    "fore": [f'<origin xyz="0.02 0 0" rpy="0.3 0 0"/><geometry>{_WEDGE}</geometry>'],
+    "hand": [
+        '<origin xyz="0.05 0 0"/><geometry><sphere radius="0.04"/></geometry>',
+        '<origin xyz="0.1 0 0.02" rpy="0.1 0.2 0.3"/><geometry><box size="0.06 0.1 0.02"/></geometry>',
+    ],
+    "claw": ['<geometry><mesh filename="meshes/claw.obj"/></geometry>'],
+}
+JOINTS = [  # name, type, parent, child, place, axis
+    ("swing", "revolute", "base", "turret", "0 0 0.1", "0 0 1"),
+    ("lift", "revolute", "turret", "arm", "0 0 0.22", "0 1 0"),
+    ("elbow", "revolute", "arm", "fore", "0.4 0 0", "0 1 0"),
+    ("roll", "revolute", "fore", "hand", "0.3 0 0", "1 0 0"),
+    ("grip", "prismatic", "hand", "claw", "0.12 0 0", "1 0 0"),
+]
+PLANNED = ("swing", "lift", "elbow", "roll")
+WEDGE = np.array([[0, -40, -30], [0, 40, -30], [0, 0, 50], [250, -20, -15], [250, 20, -15], [250, 0, 25.0]])  # mm
+_SIDES = [(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)]
+CLAW = np.array([[0, -0.02, -0.01], [0, 0.02, -0.01], [0, 0, 0.02], [0.06, 0, 0.0]])
+PROBLEM = """
+name = "crane"
+[robot]
+urdf = "crane/crane.urdf"
+joints = ["swing", "lift", "elbow", "roll"]
+tip = "hand"
+base = [0.0, -0.4, 0.8, 0.0]
+{robot}
+[limits]
+{obstacles}
+[[constraint]]
+use = "joint-position"
+tolerance = 1e-3
+[[constraint]]
+use = "robot-clearance"
+tolerance = 1e-4
+{clearance}
+{more}
+"""
+OBSTACLES = """
+[[obstacle]]
+name = "wall"
+x = [0.45, 0.55]
+y = [-0.4, 0.4]
+top = 0.3
+height = 0.3
+[[obstacle]]
+name = "roof"
+x = [-0.5, 0.5]
+y = [-0.3, 0.3]
+top = 0.9
+height = 0.05
+"""
+SELF = '[[constraint]]\nuse = "self-clearance"\ntolerance = 1e-4\n'
+
+
+def urdf(links: dict[str, list[str]] = LINKS) -> str:
+    """The text of the URDF."""
+    inertial = (
+        '<inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
+    )
+    parts = ['<robot name="crane" version="1.2">']
+    for link, shapes in links.items():
+        parts.append(f'<link name="{link}">{inertial}')
+        parts += [f"<collision>{shape}</collision>" for shape in shapes]
+        parts.append("</link>")
+    for name, kind, parent, child, place, axis in JOINTS:
+        limit = '<limit lower="-2.5" upper="2.5" velocity="2" effort="100"/>'
+        parts.append(f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>')
+        parts.append(f'<origin xyz="{place}"/><axis xyz="{axis}"/>{limit}</joint>')
+    return "\n".join([*parts, "</robot>"])
+
+
+def stl(corners: np.ndarray, sides: list[tuple[int, int, int]]) -> bytes:
+    """A mesh as binary STL."""
+    found = [struct.pack("<12fH", 0, 0, 0, *corners[list(side)].ravel(), 0) for side in sides]
+    return bytes(80) + struct.pack("<I", len(sides)) + b"".join(found)
+
+
+def write_crane(folder: Path, links: dict[str, list[str]] = LINKS) -> Path:
+    """Write the arm and its meshes; return the URDF file."""
+    meshes = folder / "crane" / "meshes"
+    meshes.mkdir(parents=True, exist_ok=True)
+    (meshes / "wedge.stl").write_bytes(stl(WEDGE, _SIDES))
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CLAW)
+    (meshes / "claw.obj").write_text(corners + "f 1 2 3\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    file = folder / "crane" / "crane.urdf"
+    file.write_text(urdf(links))
+    return file
+
+
+def write_problem(
+    folder: Path, *, robot: str = "", obstacles: str = OBSTACLES, clearance: str = "", more: str = SELF
+) -> Path:
+    """Write the arm and a problem about it; return the problem file."""
+    write_crane(folder)
+    file = folder / "problem.toml"
+    file.write_text(PROBLEM.format(robot=robot, obstacles=obstacles, clearance=clearance, more=more))
+    return file

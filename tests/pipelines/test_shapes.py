@@ -1,0 +1,132 @@
+"""Ends of motions of a robot that has a shape: capsules clear them cheaply, the pieces of its links decide."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.judges.rows.verify import verify_rows
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
+from cnpgen.pipelines.stages.collision import Collision, capsule_clearance
+from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.undecided import settle, undecided
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.world.state import World
+from tests.conftest import Prepare, run_stages
+from tests.examples.shaped_robot import write_problem
+
+TOPS = np.array([0.3, 0.9])
+PIPELINE = """
+name = "crane"
+problem = "problem.toml"
+[[stage]]
+use = "draw-positions"
+start = [[0.2, 0.7], [-0.5, -0.1], [0.1, 0.6]]
+goal = [[0.2, 0.7], [0.1, 0.5], [0.1, 0.6]]
+[[stage]]
+use = "start-ik"
+guess = [[-1.0, 1.0], [-1.0, 0.5], [0.0, 2.0], [-1.0, 1.0]]
+{collision}
+[[stage]]
+use = "goal-ik"
+[[stage]]
+use = "at-rest"
+end = "start"
+[[stage]]
+use = "at-rest"
+end = "goal"
+"""
+COLLISION = '[[stage]]\nuse = "collision"\nend = "start"\njudge = "segments"\n'
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    return load_problem(write_problem(tmp_path_factory.mktemp("crane")))
+
+
+@pytest.fixture(scope="module")
+def context(problem: Problem, cache_folder: Path) -> Context:
+    robot = load_robot(problem)
+    library = KernelLibrary("numpy", cache_folder, problem.identity, {"robot": robot, "problem": problem})
+    return Context(problem, robot, library)
+
+
+@pytest.fixture(scope="module")
+def drawn(context: Context) -> np.ndarray:
+    """Random configurations, shape (n, N)."""
+    robot = context.robot
+    return np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (600, robot.n)).T.copy()
+
+
+def measured(context: Context, drawn: np.ndarray) -> np.ndarray:
+    """The smallest distances of every state [m]: from obstacles, between links."""
+    world, zero, found = World(context.robot, context.problem.obstacle), np.zeros(context.robot.n), []
+    for q in drawn.T:
+        world.set_state(q.copy(), zero, zero, TOPS)
+        found.append((min(world.shape_distances()), min(world.self_distances())))
+    return np.array(found).T
+
+
+def test_ends_are_decided_by_the_pieces_and_only_where_capsules_are_not_clear(context, drawn, monkeypatch):
+    decide, asked = settle(context, "start"), []
+    tops, still = np.repeat(TOPS[:, None], drawn.shape[1], axis=1), np.zeros_like(drawn)
+    real = World.set_state
+    monkeypatch.setattr(World, "set_state", lambda *x: (asked.append(x[1]), real(*x))[1])
+    broken = decide((drawn, still, still), tops, np.ones(drawn.shape[1], bool))
+    assert 0.1 < len(asked) / drawn.shape[1] < 0.9
+    monkeypatch.undo()
+    distances = measured(context, drawn)
+    names = [type(each).__name__ for each in context.problem.constraint]
+    np.testing.assert_array_equal(broken[names.index("RobotClearance")], distances[0] < -1e-8)
+    np.testing.assert_array_equal(broken[names.index("SelfClearance")], distances[1] < -1e-8)
+    assert not broken[names.index("JointPosition")].any()
+    (doubts,) = context.kernels.load(undecided, end="start", dtype="float64")(drawn, still, still, tops)
+    saved = (doubts[names.index("RobotClearance")] > 0) & (distances[0] > 0)
+    assert saved.sum() > 10  # ends that capsules would have refused
+
+
+def test_what_nobody_asks_for_is_not_decided(context, drawn):
+    tops, still = np.repeat(TOPS[:, None], drawn.shape[1], axis=1), np.zeros_like(drawn)
+    assert not settle(context, "goal")((drawn, still, still), tops, np.zeros(drawn.shape[1], bool)).any()
+
+
+def test_a_robot_without_a_shape_leaves_nothing_undecided(prepare: Prepare):
+    assert settle(prepare("heavy-object").context, "start") is None
+
+
+def test_the_collision_stage_keeps_what_the_pieces_do_not_forbid(context, drawn):
+    draws = Round(drawn.shape[1])
+    draws["start_q"], draws["start_xyz"], draws["goal_xyz"] = drawn, drawn[:3], drawn[:3]
+    Collision(end="start", judge="segments").prepare(context)(draws, random_generator(0, "train", 0))
+    distance = measured(context, drawn)[0]
+    sure = np.abs(distance) > 5e-4  # Coal's answer with its usual tolerance is not exact
+    kept = np.isin(np.arange(drawn.shape[1]), draws.alive)
+    np.testing.assert_array_equal(kept[sure], (distance > 0)[sure])
+    assert draws.reasons == ["arm in collision at the start"]
+
+
+def test_the_capsules_clearance_is_a_lower_bound(context, drawn):
+    tops = np.repeat(TOPS[:, None], drawn.shape[1], axis=1)
+    (clearance,) = context.kernels.load(capsule_clearance)(drawn, tops)
+    distance = measured(context, drawn)[0]
+    assert (clearance[0] <= np.maximum(distance, 0) + 1e-9).all()
+    assert (clearance[0] > 0).mean() > 0.2
+
+
+@pytest.mark.parametrize("collision", ["", COLLISION])
+def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, prepare: Prepare, collision):
+    write_problem(tmp_path)
+    (tmp_path / "pipeline.toml").write_text(PIPELINE.format(collision=collision))
+    prepared: PreparedPipeline = prepare(load_pipeline(tmp_path / "pipeline.toml"), "numpy")
+    block = prepared.block(3, "train", 0, stop=300)
+    columns = {name: values.T for name, values in block.columns.items()}
+    report = verify_rows(prepared.context.problem, prepared.context.robot, columns)
+    assert report.ok, report.failed
+    assert {"robot clearance", "self clearance"} <= {check.name for check in report.checks}
+    draws = run_stages(prepared, 400, seed=1)
+    assert "start_clearance" not in draws.columns

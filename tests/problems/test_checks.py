@@ -1,0 +1,64 @@
+"""Robots that are wrong are said to be wrong, by what is wrong with them."""
+
+from pathlib import Path
+
+import pytest
+
+from cnpgen.errors import RecipeError
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
+from tests.examples.shaped_robot import JOINTS, urdf, write_problem
+
+TORQUE = '[[constraint]]\nuse = "joint-torque"\ntolerance = "0.5 %"\n'
+
+
+def crane(folder: Path, old: str, new: str, more: str = "") -> Path:
+    """A problem whose URDF was changed in one place."""
+    file, text = write_problem(folder, more=more), urdf()
+    assert text.count(old) >= 1
+    (folder / "crane" / "crane.urdf").write_text(text.replace(old, new))
+    return file
+
+
+def mistakes(file: Path) -> str:
+    with pytest.raises(RecipeError) as caught:
+        load_robot(load_problem(file))
+    return str(caught.value)
+
+
+def test_a_file_for_xacro_is_told_from_a_urdf(tmp_path):
+    new = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="crane"><xacro:arm side="left"/>'
+    found = mistakes(crane(tmp_path, '<robot name="crane" version="1.2">', new))
+    assert (
+        "robot.urdf: crane.urdf is to be read by xacro, expected a URDF: run 'xacro crane.urdf > robot.urdf'" in found
+    )
+
+
+def test_a_locked_joint_that_cannot_stand_at_zero_is_a_mistake(tmp_path):
+    limit = '<limit lower="-2.5" upper="2.5" velocity="2" effort="100"/>'
+    grip = next(name for name, kind, *_ in JOINTS if kind == "prismatic")
+    before, after = urdf().split(f'<joint name="{grip}"')
+    file = write_problem(tmp_path)
+    text = before + f'<joint name="{grip}"' + after.replace(limit, limit.replace('lower="-2.5"', 'lower="0.1"'))
+    (tmp_path / "crane" / "crane.urdf").write_text(text)
+    assert "'grip' is not planned and stays at zero, which is outside of its limits [0.1, 2.5]" in mistakes(file)
+    end = text.index("</joint>", text.index(f'<joint name="{grip}"'))
+    follows = text[:end] + '<mimic joint="other"/>' + text[end:]  # where such a joint stands is checked elsewhere
+    (tmp_path / "crane" / "crane.urdf").write_text(follows)
+    assert load_problem(file).name == "crane"
+
+
+def test_joints_that_move_nothing_heavy_have_no_torques(tmp_path):
+    file = crane(tmp_path, '<mass value="1"/>', '<mass value="0"/>', more=TORQUE)
+    found = mistakes(file)
+    assert found.count("no link that it moves has a mass") == 4
+    assert "swing: no link that it moves has a mass" in found
+    (tmp_path / "problem.toml").write_text(file.read_text().replace(TORQUE, ""))
+    assert load_robot(load_problem(tmp_path / "problem.toml")).n == 4
+
+
+def test_a_tip_that_is_not_there_is_refused_with_all_frames(tmp_path):
+    file = write_problem(tmp_path)
+    file.write_text(file.read_text().replace('tip = "hand"', 'tip = "hnad"'))
+    found = mistakes(file)
+    assert "robot.tip: crane.urdf has no frame 'hnad' (did you mean 'hand'?); its frames: base, turret, arm" in found
