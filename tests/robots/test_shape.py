@@ -1,5 +1,6 @@
 """Shapes from URDFs: files are found or said to be missing, pieces are what they say, capsules cover them."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.robots.attached import Attached
 from cnpgen.robots.robot import reduced_model
 from cnpgen.robots.shape import pairs
@@ -19,7 +22,7 @@ from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.piece import SIDES, Piece, link_pieces
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.robots.shape.srdf import disabled_pairs, with_disabled_pairs
-from tests.examples.shaped_robot import CLAW, LINKS, PLANNED, WEDGE, urdf, write_crane
+from tests.examples.shaped_robot import CLAW, LINKS, PLANNED, WEDGE, urdf, write_crane, write_problem
 
 
 def load(file: Path, keep: Path) -> Shape:
@@ -197,8 +200,27 @@ def test_capsules_and_pairs_are_kept_and_what_was_damaged_is_found_again(tmp_pat
         third = load(file, tmp_path / "kept")
     assert repr(third.pairs) == repr(again.pairs)
     np.testing.assert_array_equal(third.capsules[3].first, again.capsules[3].first)
-    kept.write_text(kept.read_text()[:-40])
-    assert repr(load(file, tmp_path / "kept").pairs) == repr(again.pairs)
+    whole = kept.read_text()
+    thinner = json.loads(whole)
+    thinner["capsules"][2]["radius"] *= 0.9  # it no longer covers the link
+    for damaged in (whole[:-40], json.dumps(thinner)):
+        kept.write_text(damaged)
+        found = load(file, tmp_path / "kept")
+        assert repr(found.pairs) == repr(again.pairs)
+        assert [c.radius for c in found.capsules] == [c.radius for c in again.capsules]
+    assert kept.read_text() == whole
+
+
+def test_nothing_is_kept_where_others_may_write(tmp_path, monkeypatch):
+    monkeypatch.setattr(pairs, "SAMPLES", 300)
+    problem = load_problem(write_problem(tmp_path))
+    for mode, count in ((0o700, 1), (0o777, 0)):
+        cache = tmp_path / f"cache-{mode}"
+        cache.mkdir()
+        cache.chmod(mode)
+        monkeypatch.setenv("CNPGEN_CACHE", str(cache))
+        assert load_robot(problem).shape is not None
+        assert len(list(cache.glob("shape-*.json"))) == count
 
 
 def test_pairs_are_those_that_can_collide(shape):

@@ -66,6 +66,12 @@ def covering_capsule(pieces: Sequence[Piece]) -> Capsule:
     return min([*starts[:1], *found], key=_by_overhang)
 
 
+def covers(capsule: Capsule, pieces: Sequence[Piece]) -> bool:
+    """Whether a capsule holds all pieces of its link: being convex it does if it holds their corners."""
+    reach = [_distances(each.vertices, capsule.first, capsule.second)[0].max() + each.radius for each in pieces]
+    return bool(reach) and max(reach) <= capsule.radius
+
+
 def _by_overhang(capsule: Capsule) -> float:
     return capsule.overhang
 

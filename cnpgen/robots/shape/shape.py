@@ -14,7 +14,7 @@ import numpy as np
 
 from cnpgen.errors import MachineError, RecipeError
 from cnpgen.robots.chain import frame_of
-from cnpgen.robots.shape.capsule import Capsule, covering_capsule
+from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
 from cnpgen.robots.shape.pairs import LinkPair, find_pairs
 from cnpgen.robots.shape.piece import Piece, link_pieces
 from cnpgen.robots.shape.srdf import disabled_pairs
@@ -61,13 +61,13 @@ class Shape:
         return tuple(capsule for capsule in self.capsules if self.joints[capsule.link])
 
 
-def load_shape(urdf: str, model: "pin.Model", keep: Path) -> Shape:
+def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
     """Load the shape that a URDF gives its robot.
 
     Args:
         urdf: Its text, with the meshes in it (``cnpgen.robots.shape.inline``).
         model: Its Pinocchio model, reduced to the planned joints.
-        keep: Folder in which capsules and pairs are kept, since they take some seconds to find.
+        keep: Folder in which capsules and pairs are kept, since they take some seconds to find; None to keep nothing.
 
     Raises:
         RecipeError: The URDF has no collision geometry, or some that cannot be read.
@@ -76,17 +76,23 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path) -> Shape:
     if not any(joints.values()):
         raise RecipeError(["no link that moves has a <collision> element, so that the robot has no shape"])
     numbers = [REVISION, urdf, list(model.names), *(list(limit) for limit in _limits(model))]
-    file = keep / f"shape-{hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:32]}.json"
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        return Shape(pieces, joints, *_read(json.loads(file.read_text(encoding="utf-8"))))
-    capsules = tuple(covering_capsule([each for each in pieces if each.link == link]) for link in joints)
+    name = f"shape-{hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:32]}.json"
+    if keep is not None:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            return Shape(pieces, joints, *_read(json.loads((keep / name).read_text(encoding="utf-8")), pieces))
+    capsules = tuple(covering_capsule(_of(link, pieces)) for link in joints)
     by_link = {capsule.link: capsule for capsule in capsules}
     pairs = find_pairs(
         model, pieces, by_link, joints=joints, adjacent=_adjacent(urdf, set(joints)), disabled=disabled_pairs(urdf)
     )
-    with suppress(MachineError):
-        write_file(file, json.dumps(_written(capsules, pairs)))
+    if keep is not None:
+        with suppress(MachineError):
+            write_file(keep / name, json.dumps(_written(capsules, pairs)))
     return Shape(pieces, joints, capsules, pairs)
+
+
+def _of(link: str, pieces: tuple[Piece, ...]) -> list[Piece]:
+    return [piece for piece in pieces if piece.link == link]
 
 
 def _placed(pieces: list[Piece], model: "pin.Model") -> tuple[tuple[Piece, ...], dict[str, int]]:
@@ -126,9 +132,12 @@ def _written(capsules: tuple[Capsule, ...], pairs: tuple[LinkPair, ...]) -> dict
     return {"capsules": entries, "pairs": [asdict(pair) for pair in pairs]}
 
 
-def _read(content: dict[str, Any]) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+def _read(content: dict[str, Any], pieces: tuple[Piece, ...]) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+    """Return what was kept; a ValueError says that a capsule does not cover its link."""
     capsules = tuple(
         Capsule(**each | {"first": np.array(each["first"]), "second": np.array(each["second"])})
         for each in content["capsules"]
     )
+    if not all(covers(capsule, _of(capsule.link, pieces)) for capsule in capsules):
+        raise ValueError("a capsule does not cover its link")
     return capsules, tuple(LinkPair(**pair) for pair in content["pairs"])
