@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
-from refiner_problems import grid_of_hits, make_each
+from refiner_problems import PUCKS, make_each
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.boundary_problems import draw_boundary_problems
@@ -93,7 +93,7 @@ def refine(plans: Plans) -> dict[str, float]:
 def measure_grid(name: str) -> dict[str, float]:
     """The 81 pucks on a grid, hit from rest."""
     progress(f"{name}: 81 pucks on a grid")
-    plans = Planner(name).plan_batch(grid_of_hits().boundary)
+    plans = Planner(name).plan_batch(draw_boundary_problems("airhockey-pucks", PUCKS).boundary)
     made = make_each(plans, DEFAULT)
     strict = int(evaluate_plans(plans).valid.sum())
     return {"grid, strict of 81": strict, "grid, refined valid of 81": sum(each.valid for each in made)}

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
 from ipopt import with_ipopt
-from refiner_problems import Made, grid_of_hits, like_a_networks, make_each
+from refiner_problems import PUCKS, Made, like_a_networks, make_each
 from slsqp import minimise_slsqp
 
 from cnpgen.machine.threads import one_thread
@@ -52,7 +52,7 @@ Result = tuple[dict[str, Any], list[str]]
 
 def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
     """Solve the 81 hits several times: the middle run counts; beside it the least times, least disturbed by others."""
-    problems = grid_of_hits()
+    problems = draw_boundary_problems("airhockey-pucks", PUCKS)
     starts = like_a_networks(problems, make_each(problems, RefineOptions()), options.seed)
     plans = {"from nothing": problems, "network-like start": starts}
     runs = [{start: make_each(given, RefineOptions()) for start, given in plans.items()} for _ in range(RUNS)]

@@ -7,15 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Verdict
-from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.load import load_pipeline
-from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
-from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.stages.stage import Round
-from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem, record_problem
+from cnpgen.problems.record import open_problem
 from cnpgen.refine.engine import prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
@@ -27,9 +20,7 @@ from cnpgen.trajectory.boundary import assemble
 from cnpgen.trajectory.motion import Motion
 
 Array = NDArray[np.float64]
-PUCKS_X, PUCKS_Y = np.linspace(0.8, 1.2, 9), np.linspace(-0.4, 0.4, 9)  # m
-GOAL = np.array([2.478, 0.0])  # m, where the puck is sent
-BEHIND = 0.07  # m, from the puck's centre to where the mallet meets it
+PUCKS = 81  # problems of the dataset airhockey-pucks
 LARGEST_Z, SMALLEST_Z, TOO_FAST = 0.010, 0.002, 1.05  # of a network-like start
 
 
@@ -85,32 +76,6 @@ def _make(tool: Refiner, jury: WatchedJury, task: Task) -> Made:
     ms = 1e3 * (time.process_time() - start)
     duration = float(Motion(refined.path[None], refined.rate[None], tool.spec.degree).duration()[0])
     return Made(refined, ms, 1e3 * jury.seconds, duration)
-
-
-def grid_of_hits() -> Plans:
-    """The 81 hits from rest in the base configuration.
-
-    The mallet meets the puck ``BEHIND`` its centre on the line to the goal, at the highest speed along that line; all
-    these places are on the table.
-    """
-    pipeline = load_pipeline("airhockey-hit")
-    backend, cache_folder = choose_backend(None)
-    context = PreparedPipeline(pipeline, backend=backend, cache_folder=cache_folder).context
-    puck = np.stack(np.meshgrid(PUCKS_X, PUCKS_Y, indexing="ij")).reshape(2, -1)
-    along = (GOAL[:, None] - puck) / np.linalg.norm(GOAL[:, None] - puck, axis=0)
-    draws, base = Round(puck.shape[1]), context.robot.base
-    height = next(each.z for each in context.problem.constraint if hasattr(each, "start_band"))
-    draws["goal_xyz"] = np.vstack([puck - BEHIND * along, np.full(draws.size, height)])
-    draws["hit_angle"] = np.arctan2(along[1], along[0])[None]
-    for stage in (HittingConfiguration(near="base"), HittingVelocity(full_speed=1.0)):
-        stage.prepare(context)(draws, np.random.default_rng(0))
-    assert not draws.reasons or len(draws.alive) == draws.size
-    columns = {name: values.T for name, values in draws.columns.items()}
-    still = np.zeros((draws.size, context.robot.n))
-    start = {"start_q": still + base, "start_dq": still, "start_ddq": still}
-    start["start_xyz"] = np.tile(Arm(context.robot).at(base).position, (draws.size, 1))
-    columns |= {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed", "hit_speed_max")}
-    return plans_of_rows(record_problem(context.problem), {**columns, **start})
 
 
 def like_a_networks(plans: Plans, made: list[Made], seed: int) -> Plans:

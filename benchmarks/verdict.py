@@ -1,28 +1,36 @@
 """CPU time of the verdict per plan, beside the same check with one state of Pinocchio and Coal at a time.
 
-Both look at the same moments; the second measures every constraint at every one of them. The verdict's time is the
-median over repetitions of the mean over all plans; both ways take turns on the plans that they share.
+The second measures every constraint at every moment of the time grid, and looks at nothing between them. The verdict's
+time is the median over repetitions of the mean over all plans; both ways take turns on the plans that they share.
+
+With ``--always N``, N plans of each file are made to lie at a tolerance, a hundred-thousandth of it on either side, and
+judged at ever finer steps: whether they are valid must not depend on the step.
 
     cnpgen solve airhockey-hit --n 100 -o hits.h5
-    python benchmarks/verdict.py hits.h5
+    python benchmarks/verdict.py hits.h5 --always 100
 """
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from common import arguments, median, report, table, verdict
 
-from cnpgen.judges.plans import Verdict, judge
+from cnpgen.judges.plans import Margin, Reason, Verdict, judge
 from cnpgen.judges.plans.course import course
 from cnpgen.judges.plans.sampling import sample, time_table
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
+from cnpgen.trajectory.motion import Motion
 from cnpgen.world.state import World
 
 STEP = 1e-3  # s
+STEPS = (1e-3, 1e-4, 1e-5)  # s
+NEAR = 1e-5  # of what is allowed: so near to a tolerance do plans lie
+EXCEEDED = 1e-6  # in its unit: so much must a condition be exceeded by for a plan to lie at its tolerance
 TARGETS = {"airhockey": 3.0, "heavy-object": 8.0}  # ms per plan
 
 
@@ -36,8 +44,8 @@ class Timing:
         moments: Moments per plan that were looked at, on average.
         ms: CPU time of the verdict per plan [ms].
         times_faster: CPU time of the check state by state, in times the verdict's.
-        difference: Largest difference between both of how far a condition is exceeded, in what it allows; without
-            contacts, of which the verdict takes a closer look.
+        missed: How much more than the verdict the check state by state saw at most, in what is allowed.
+        between: How much more the verdict saw between moments.
     """
 
     problem: str
@@ -45,7 +53,8 @@ class Timing:
     moments: float
     ms: float
     times_faster: float
-    difference: float
+    missed: float
+    between: float
 
 
 def judged(plans: Plans) -> tuple[list[Verdict], float]:
@@ -86,21 +95,69 @@ def measure(plans: Plans, *, repeat: int, slow: int) -> Timing:
     few = plans[:slow]
     verdicts, _ = judged(plans)  # warms up, too
     times = [judged(plans)[1] / len(plans) for _ in range(repeat)]
-    ratios, difference = [], 0.0
+    ratios, missed, between = [], 0.0, 0.0
     for _ in range(repeat):
         fast, slowly = judged(few)[1], state_by_state(few)
         ratios.append(slowly[1] / fast)
         for found, expected in zip(verdicts, slowly[0], strict=False):
-            for name in expected.keys() - {"object contact"}:
-                difference = max(difference, abs(found.margins[name].severity - expected[name]))
+            for name, severity in expected.items():
+                missed = max(missed, severity - found.margins[name].severity)
+                between = max(between, found.margins[name].severity - severity)
     moments = float(np.mean([found.samples for found in verdicts]))
-    return Timing(plans.problem.name, len(plans), moments, 1e3 * median(times), median(ratios), difference)
+    return Timing(plans.problem.name, len(plans), moments, 1e3 * median(times), median(ratios), missed, between)
+
+
+@dataclass(frozen=True)
+class Always:
+    """What became of plans at a tolerance.
+
+    Attributes:
+        problem: Name of the problem.
+        plans: Number of plans.
+        wrong: How many of them were called valid, or not valid, at a step at which they are not, or are.
+    """
+
+    problem: str
+    plans: int
+    wrong: int
+
+
+def at_the_tolerance(problem: Problem, margin: Margin, by: float) -> Problem:
+    """Return the problem in which one condition allows the share ``by`` more than is exceeded, all others anything."""
+    share = margin.excess / margin.allowed * (1 + by)
+    tolerances = [each.tolerance * (share if each.reason == margin.reason else 1e3) for each in problem.constraint]
+    changed = [replace(each, tolerance=new) for each, new in zip(problem.constraint, tolerances, strict=True)]
+    return replace(problem, constraint=tuple(changed))
+
+
+def always(plans: Plans, count: int, seed: int) -> Always:
+    """Bend plans a little, make a tolerance of what one condition is exceeded by, and judge them at every step."""
+    problem, robot = open_problem(plans.problem)
+    random = np.random.default_rng(seed)
+    wrong = 0
+    for k in range(count):
+        given = plans[[k % len(plans)]]
+        path = given.path_control_points.copy()
+        path[:, 3:-3] += random.uniform(-0.02, 0.02, path[:, 3:-3].shape)
+        motion = Motion(path, given.rate_control_points)
+        rest = motion, given.boundary, given.columns["start_xyz"], given.columns["goal_xyz"]
+        margins = judge(problem, robot, *rest, step=STEP)[0].margins
+        exceeded = [name for name, each in margins.items() if each.reason != Reason.BOUNDARY and each.excess > EXCEEDED]
+        name, near = exceeded[random.integers(len(exceeded))], problem
+        for _ in range(4):  # each time more exactly, since it decides
+            near = at_the_tolerance(near, judge(near, robot, *rest, step=STEP)[0].margins[name], 0.0)
+        by = NEAR if k % 2 else -NEAR
+        last = at_the_tolerance(near, judge(near, robot, *rest, step=STEP)[0].margins[name], by)
+        wrong += any(judge(last, robot, *rest, step=step)[0].valid != (by > 0) for step in STEPS)
+    return Always(plans.problem.name, count, wrong)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("file", nargs="+", type=Path, help="files of plans")
     parser.add_argument("--repeat", type=int, default=3, help="repetitions")
+    parser.add_argument("--always", type=int, default=0, metavar="N", help="plans of each file at a tolerance")
+    parser.add_argument("--seed", type=int, default=20265, help="of the plans at a tolerance")
     parser.add_argument("--slow", type=int, default=4, help="plans of each file that are also checked state by state")
 
 
@@ -108,7 +165,7 @@ def main() -> None:
     """Run the benchmark."""
     options = arguments(__doc__, add)
     found = [measure(load_plans(file), repeat=options.repeat, slow=options.slow) for file in options.file]
-    head = ("problem", "plans", "moments", "ms per plan", "target", "", "times faster", "difference")
+    head = ("problem", "plans", "moments", "ms per plan", "target", "", "times faster", "missed", "between")
     rows = [
         (
             item.problem,
@@ -117,12 +174,20 @@ def main() -> None:
             f"{item.ms:.2f}",
             *verdict(item.ms, TARGETS.get(item.problem), at_most=True),
             f"{item.times_faster:.1f}",
-            f"{item.difference:.1e}",
+            f"{item.missed:.1e}",
+            f"{item.between:.1e}",
         )
         for item in found
     ]
     tables = [table("the verdict of a plan, CPU time on one core", head, rows)]
-    report({"verdict": [vars(item) for item in found]}, tables, as_json=options.json)
+    content = {"verdict": [vars(item) for item in found]}
+    if options.always:
+        steps = [always(load_plans(file), options.always, options.seed) for file in options.file]
+        rows = [(item.problem, str(item.plans), str(item.wrong)) for item in steps]
+        title = f"plans at a tolerance, judged every {', '.join(f'{1e6 * step:g}' for step in STEPS)} us"
+        tables.append(table(title, ("problem", "plans", "wrong at any step"), rows))
+        content["always"] = [vars(item) for item in steps]
+    report(content, tables, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
 
 _TEXT = """\
-Every plan is looked at on a fine time grid and judged for itself; docs/verdict.md says by what. The exit code is 0 if
+Every plan is looked at on a fine time grid and between its moments; docs/verdict.md says how. The exit code is 0 if
 every plan is valid, and 1 if any is not, if there are none, or if the file is damaged. --workers changes nothing but
 the time that it takes.
 """

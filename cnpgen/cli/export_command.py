@@ -12,6 +12,7 @@ from cnpgen.cli.plan_files import read_plans
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.plans.export import Exported
+    from cnpgen.plans.join import JoinedPlans
 
 FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.plans.export, which takes a while to import
 NAMED = 10  # plans that are not valid, by number
@@ -19,7 +20,8 @@ NAMED = 10  # plans that are not valid, by number
 _TEXT = """\
 npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
 docs/plan-format.md shows how to read them. What was written is printed on stdout. Plans that cannot be sampled are
-named on stderr and left out; the exit code is then 1.
+named on stderr and left out; the exit code is then 1. With --join what is exported is executed as it is: positions,
+velocities and accelerations go on from plan to plan without a jump (1e-9 in SI), or nothing is written.
 """
 
 
@@ -39,6 +41,20 @@ def add(commands: "Commands[Parser]") -> None:
     )
     option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
     option("--sample", metavar="I", type=values.numbers, help="these samples' plans only, by sample_id; adds to --plan")
+    option(
+        "--join",
+        metavar="NEXT",
+        type=Path,
+        action="append",
+        help="cut every plan of FILE and go on with the plan of the same number of this file of plans; may be repeated",
+    )
+    option(
+        "--at",
+        metavar="S",
+        type=values.seconds,
+        action="append",
+        help="when NEXT takes over, since the start: 330ms; once for each --join (default: at the end)",
+    )
     option("--force", action="store_true", help="replace files that are there")
 
 
@@ -46,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.plans.export import export_plans
 
-    plans = read_plans(arguments.file)
+    plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments)
     exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=chosen)
     for why in exported.refused.values():
@@ -56,6 +72,20 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
     print(exported.files[0] if arguments.to == "npz" else out)
     return 1 if exported.refused else 0
+
+
+def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
+    """Read the plans, and join them with those that follow."""
+    from cnpgen.errors import UsageError
+    from cnpgen.plans.join import join_plans
+
+    plans: Plans | JoinedPlans = read_plans(arguments.file)
+    following, times = arguments.join or [], arguments.at or []
+    if times and len(times) != len(following):
+        raise UsageError(f"--at is given {len(times)} times, --join {len(following)} times: expected one for each")
+    for file, time in zip(following, times or [None] * len(following), strict=True):
+        plans = join_plans(plans, read_plans(file), at=time)
+    return plans
 
 
 def _counted(exported: "Exported") -> str:
@@ -86,7 +116,7 @@ def _place(arguments: argparse.Namespace) -> Path:
     return out
 
 
-def _chosen(plans: "Plans", arguments: argparse.Namespace) -> list[int] | None:
+def _chosen(plans: "Plans | JoinedPlans", arguments: argparse.Namespace) -> list[int] | None:
     """Return the indices of the plans that are wanted, or None for all of them."""
     import numpy as np
 

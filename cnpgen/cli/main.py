@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cnpgen.cli import (
+    benchmark_command,
+    complete_command,
     doctor_command,
     evaluate_command,
     export_command,
@@ -23,6 +25,7 @@ from cnpgen.cli import (
     plan_command,
     refine_command,
     show_command,
+    simulate_command,
     solve_command,
     train_command,
     validate_command,
@@ -30,6 +33,7 @@ from cnpgen.cli import (
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
 from cnpgen.cli.shell import in_shell
+from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
 from cnpgen.machine.threads import prefer_one_thread
 
@@ -43,9 +47,12 @@ _COMMANDS = (
     validate_command,
     train_command,
     plan_command,
+    complete_command,
     solve_command,
     refine_command,
     evaluate_command,
+    simulate_command,
+    benchmark_command,
     export_command,
     doctor_command,
 )
@@ -61,8 +68,11 @@ examples:
   cnpgen train airhockey-hit-v1 -o hits.h5           train a planner: two minutes
   cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5; a shipped one: --model airhockey-hit
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
+  cnpgen complete airhockey-replan pucks.csv -o problems.h5; what is solved, refined or planned for
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
+  cnpgen simulate plans.h5 --video plan.mp4          execute them in MuJoCo
+  cnpgen benchmark hits-81 --simulate                compare planners
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
 
 stdout is data, stderr everything else. Exit codes:
@@ -104,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
-    with _warnings_on_one_line():
+    with printing_safely(), _warnings_on_one_line():
         try:
             with interruptible():
                 code = _run(words, given)

@@ -50,6 +50,7 @@ class Meter:
                 unit=self._noun,
                 unit_scale=True,
                 leave=False,
+                file=getattr(sys.stderr, "terminal", sys.stderr),
                 dynamic_ncols=True,
             )
         elif not self._quiet:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.plans import Refinement
 
-REFINING = ("objective", "weight", "max_iterations", "tolerance", "step")  # what add_refining adds
+REFINING = ("objective", "weight", "max_iterations", "tolerance", "step", "deadline")  # what add_refining adds
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
@@ -64,6 +64,12 @@ def add_refining(parser: Options) -> None:
         " among obstacles a twentieth)",
     )
     option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms, which is the most)")
+    option(
+        "--deadline",
+        metavar="S",
+        type=values.seconds,
+        help="how long each plan may take, 10ms for example: the best valid one until then, never worse than the given",
+    )
     option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")
 
 

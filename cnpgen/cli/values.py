@@ -76,8 +76,14 @@ def part(text: str) -> tuple[int, int]:
 
 def plot_file(text: str) -> str:
     """Read the name of a picture file that can be written, as far as its folder tells before it is drawn."""
-    if not text.lower().endswith((".png", ".pdf", ".svg")):
-        raise ArgumentTypeError(f"expected a file that ends in .png, .pdf or .svg, got {text!r}")
+    return picture_file(text, ".png", ".pdf", ".svg")
+
+
+def picture_file(text: str, *endings: str) -> str:
+    """Read the name of a file with one of some endings, in a folder that is there."""
+    if not text.lower().endswith(endings):
+        expected = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
+        raise ArgumentTypeError(f"expected a file that ends in {expected}, got {text!r}")
     if not Path(text).absolute().parent.is_dir():
         raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
     return text

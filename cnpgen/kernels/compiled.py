@@ -44,7 +44,7 @@ class CompiledKernel(Kernel):
         n = check_arguments(self.tape, arguments)
         results = [np.empty((width, n)) for width in self.tape.outputs]
         if n:
-            strides = (ctypes.c_long * len(arguments))(*[argument.strides[0] // 8 for argument in arguments])
+            strides = _array_type(ctypes.c_long, len(arguments))(*[argument.strides[0] // 8 for argument in arguments])
             self._function(ctypes.c_long(n), _pointers(arguments), strides, _pointers(results))
         return results
 
@@ -76,11 +76,19 @@ def _load(library: Path) -> Any:
 def _distances(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_long]":
     """Distances from component to component and from node to node, in numbers; 0 where there are no nodes."""
     flat = (stride // array.itemsize for array in arrays for stride in (*array.strides, 0)[:2])
-    return (ctypes.c_long * (2 * len(arrays)))(*flat)
+    found: ctypes.Array[ctypes.c_long] = _array_type(ctypes.c_long, 2 * len(arrays))(*flat)
+    return found
 
 
 def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
-    return (ctypes.c_void_p * len(arrays))(*map(_address, arrays))
+    found: ctypes.Array[ctypes.c_void_p] = _array_type(ctypes.c_void_p, len(arrays))(*map(_address, arrays))
+    return found
+
+
+@cache
+def _array_type(kind: Any, count: int) -> Any:
+    """Return ``kind * count``; ctypes makes the type anew, in several microseconds, where nobody keeps it."""
+    return kind * count
 
 
 def _address(array: Any) -> int:

@@ -10,12 +10,14 @@ from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.schema.arguments import flag
 from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.files.documents import load_document
+from cnpgen.store.files.limits import ALWAYS, EXPANSION
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import PLAN, STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.statistics import FieldStatistics, statistics_from_json
-from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise
+from cnpgen.store.shard import storage_dtype
+from cnpgen.store.statistics import FieldStatistics, are_of, statistics_from_json
+from cnpgen.store.summary import STATS_FORM, STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise
 
 Statistics = dict[str, dict[str, FieldStatistics]]
 
@@ -45,6 +47,7 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
             _listed(folder, stored.blueprint, stored.manifest),
             _load_statistics(folder, stored.blueprint),
         )
+    _check_rows(stored.blueprint, shards)
     present = _present(folder, shards, allow_incomplete=allow_incomplete)
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
@@ -92,13 +95,27 @@ def _listed(folder: Path, blueprint: Blueprint, manifest: Mapping[str, Any]) -> 
 def _load_statistics(folder: Path, blueprint: Blueprint) -> Statistics:
     """Read the statistics of a finished dataset."""
     path = folder / STATS
-    document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+    document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION, form=STATS_FORM)
     if document["plan_fingerprint"] != blueprint.fingerprint:
         raise DatasetError(f"{path} is of another blueprint than {PLAN}; {AGAIN}")
-    return {
-        split: {name: statistics_from_json(content) for name, content in fields.items()}
-        for split, fields in document["splits"].items()
-    }
+    try:
+        found = {
+            split: {name: statistics_from_json(content) for name, content in fields.items()}
+            for split, fields in document["splits"].items()
+        }
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: {error}; {AGAIN}") from error
+    if not all(are_of(statistics, blueprint.fields) for statistics in found.values()):
+        raise DatasetError(f"{path} is of other fields than {PLAN}; {AGAIN}")
+    return found
+
+
+def _check_rows(blueprint: Blueprint, shards: Mapping[str, list[Shard]]) -> None:
+    """Refuse shards that cannot have as many rows as is recorded, before room is made for them."""
+    width = sum(max(field.width, 1) * storage_dtype(field, blueprint.dtype).itemsize for field in blueprint.fields)
+    for shard in (each for part in shards.values() for each in part):
+        if shard.rows * width > max(EXPANSION * shard.size, ALWAYS):
+            raise DatasetError(f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {PLAN}")
 
 
 def _present(

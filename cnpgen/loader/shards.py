@@ -15,7 +15,7 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import AGAIN, digest_problem, size_problem
 from cnpgen.store.layout import PLAN
-from cnpgen.store.shard import Placement, read_attributes, read_placements, read_shard
+from cnpgen.store.shard import Placement, read_placements, read_shard
 
 MOST_MAPS = 32  # that are kept; each holds a file descriptor, and pages that the system may take back at any time
 
@@ -93,10 +93,10 @@ class ShardReader:
     def _check(self, shard: Shard) -> dict[str, Placement]:
         if self._verify and file_sha256(shard.path) != shard.sha256:
             raise DatasetError(f"{digest_problem(shard.path)}; {AGAIN}")
-        found = read_attributes(shard.path, ["plan_key", "first_sample_id", "rows"])  # texts may hang HDF5: see there
+        placements, found = read_placements(shard.path)
         if found != {"plan_key": shard.key, "first_sample_id": shard.first_row, "rows": shard.rows}:
             raise DatasetError(f"{shard.path} is of another dataset or another place in it; {AGAIN}")
-        self._placements[shard.path] = placements = read_placements(shard.path)
+        self._placements[shard.path] = placements
         return placements
 
     def _map(self, shard: Shard) -> mmap.mmap | None:

@@ -4,6 +4,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.versions import versions
@@ -72,6 +74,8 @@ def draw_up(
         shard_size = begun.shard_size if shard_size is None else shard_size
     chosen, cache_folder = choose_backend(backend)
     prepared = PreparedPipeline(recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
+    if prepared.tasks is not None:
+        total = _answered(prepared, recipe, root, n)
     splits = split_rows(recipe, total)
     blueprint = Blueprint(
         name=recipe.name,
@@ -105,6 +109,24 @@ def _check(
     total = integer("n", sum(recipe.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
     root = integer("seed", recipe.seed if seed is None else seed, least=0, most=MAX_SEED)
     return total, root, None if shard_size is None else integer("shard_size", shard_size, least=1)
+
+
+def _answered(prepared: PreparedPipeline, recipe: DatasetRecipe, seed: int, n: int | None) -> int:
+    """Return how many rows a dataset of listed tasks has: one for each that has an answer, or as many as are wanted.
+
+    Raises:
+        UsageError: More are wanted, or none has an answer, or there are splits to share them.
+    """
+    if len(recipe.splits) > 1:
+        splits = ", ".join(recipe.splits)
+        raise UsageError(f"{recipe.name} lists its tasks: they would be the same in its splits {splits}, expected one")
+    found, wanted = prepared.answers(seed), sum(recipe.splits.values()) if n is None else n
+    rows = len(found.alive)
+    if not rows or (n is not None and n > rows):
+        counts = zip(found.reasons, np.bincount(found.fate, minlength=1 + len(found.reasons))[1:], strict=True)
+        why = ", ".join(f"{count} {reason}" for reason, count in counts if count) or "it lists no more"
+        raise UsageError(f"{recipe.name} has {rows} rows, of {prepared.tasks} tasks ({why}): got n = {wanted}")
+    return min(rows, wanted)
 
 
 def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:

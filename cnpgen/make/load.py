@@ -12,6 +12,7 @@ from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.load import read_pipeline
 from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.prepared import listed_tasks
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
 from cnpgen.problems.load import missing_kinds, restoring_reader, without_defaults
@@ -27,7 +28,8 @@ from cnpgen.store.blueprint import Blueprint
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
     """Load a dataset recipe, its pipeline and its problem.
 
-    A pipeline can be given as well: it becomes version 1.0.0 of a dataset of its name, 90 % training, 10 % validation.
+    A pipeline can be given as well: it becomes version 1.0.0 of a dataset of its name, 90 % training, 10 % validation;
+    one that lists its tasks becomes one of training rows.
 
     Args:
         name_or_path: Name of a shipped dataset or pipeline, or path of such a file.
@@ -118,7 +120,7 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
         name=pipeline.name,
         title=pipeline.title,
         pipeline=pipeline,
-        splits={"train": 90, "validation": 10},
+        splits={"train": 90, "validation": 10} if (tasks := listed_tasks(pipeline)) is None else {"train": tasks},
         path=pipeline.path,
     )
 

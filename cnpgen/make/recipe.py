@@ -13,9 +13,9 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.problems.problem import resolved, without_labels
 from cnpgen.schema.keys import NAME, field
 
-SPLIT_NAME = "^[a-z][a-z0-9_]*$"
+SPLIT_NAME = "^[a-z][a-z0-9_]{0,99}$"
 MAX_SEED = 2**63 - 1
-VERSION = r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$"
+VERSION = r"^(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})$"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 It shares no assumption with the stages before it: nothing about convergence, order or exactness is taken for granted.
 """
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,13 +24,15 @@ if TYPE_CHECKING:
 ROUNDING = 1e-14  # m/s: of a velocity that ought to be zero
 
 
-def acceptance(context: Context, written: set[str]) -> Work:
+def acceptance(context: Context, written: set[str], *, given: Collection[End] = ()) -> Work:
     """Prepare the gate.
 
     Args:
         context: The surroundings.
         written: Columns that the stages write; accelerations and torques of the goal are checked if its acceleration
             is known.
+        given: Ends whose state is somebody else's, measured perhaps: they need not be exact, but no further outside of
+            the constraints than motions may be.
 
     Returns:
         A function that rejects, under each constraint's reason, what is not exactly a boundary problem.
@@ -37,7 +40,11 @@ def acceptance(context: Context, written: set[str]) -> Work:
     ends: tuple[End, ...] = ("start", "goal")
     kernels = {
         end: context.kernels.load(
-            boundary_unmet, end=end, needs=2 if f"{end}_ddq" in written else 1, dtype=context.dtype
+            boundary_unmet,
+            end=end,
+            needs=2 if f"{end}_ddq" in written else 1,
+            dtype=context.dtype,
+            exact=end not in given,
         )
         for end in ends
     }
@@ -61,12 +68,13 @@ def acceptance(context: Context, written: set[str]) -> Work:
             gates.append(("hit not along its direction", missed[0] <= 0))
         alive = draws.alive
         for reason, ok in gates:
-            draws.reject(ok[np.searchsorted(alive, draws.alive)], reason)
+            left = ok if len(draws.alive) == len(alive) else ok[np.searchsorted(alive, draws.alive)]
+            draws.reject(left, reason)
 
     return work
 
 
-def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str) -> Any:
+def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True) -> Any:
     """Build ``(q, dq, ddq, tops, position) -> unmet``, positive where a boundary state is not exact or not a number.
 
     Args:
@@ -75,6 +83,8 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
         end: Which end of the motion.
         needs: The highest derivative of q that is known there; conditions on higher ones are left out.
         dtype: How exactly (see ``EXACTNESS``).
+        exact: Whether it must be exact; else it may be as far outside as motions may, and what only boundary states
+            must meet is left out.
 
     Returns:
         A function whose result has one row per constraint, in order, and one for the position of the tip.
@@ -88,9 +98,11 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
     rows: list[Scalar] = []
     for constraint in problem.constraint:
         unmet: Scalar = ca.SX(0)
+        along = {each.name: constraint.allowed(each) for each in constraint.symbolic(state)}
         for condition in constraint.symbolic_at(state, end):
-            if symbolic_needs(condition, dq_sx, ddq_sx) <= needs:
-                unmet = unmet + _unmet(condition.g, condition.lower, condition.upper, condition.slack(dtype))
+            if symbolic_needs(condition, dq_sx, ddq_sx) <= needs and (exact or condition.name in along):
+                slack = condition.slack(dtype) if exact else np.maximum(along[condition.name], condition.slack(dtype))
+                unmet = unmet + _unmet(condition.g, condition.lower, condition.upper, slack)
         rows.append(unmet)
     miss = subtract(p, state.kinematics.tip)
     rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= EXACTNESS[dtype]["position"]))

@@ -1,12 +1,14 @@
 """What a stage is prepared with: the problem, its robot and the kernels."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 from cnpgen.errors import RecipeError
-from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.library import Backend, KernelLibrary, problem_kernels
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.store.field import Field
@@ -52,3 +54,9 @@ class Context:
         }[unit]
         low, high = (tuple(float(x) for x in bound) for bound in bounds)
         return Field(name, unit, long_name, robot.n, robot.joint_names, role, valid_min=low, valid_max=high)
+
+
+def load_context(problem: Problem, backend: Backend, cache_folder: Path, dtype: str = "float64") -> Context:
+    """Load the robot of a problem, and say where its kernels are loaded from."""
+    robot = load_robot(problem)
+    return Context(problem, robot, problem_kernels(problem, robot, backend, cache_folder), dtype)

@@ -1,12 +1,15 @@
 """Pipelines from files, by name or path."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from cnpgen.errors import PluginError, RecipeError
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
-from cnpgen.problems.load import read_problem
+from cnpgen.problems.load import missing_kinds, read_problem, without_defaults
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
@@ -39,3 +42,26 @@ def read_pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
     }
     made = parse(Pipeline, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
     return made and replace(made, path=path.absolute())
+
+
+def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Problem) -> Pipeline:
+    """Rebuild a pipeline from its resolved stages, as blueprints of datasets and models keep them.
+
+    Args:
+        name: Its name.
+        stages: The tables of its stages.
+        problem: Its problem.
+
+    Raises:
+        RecipeError: They do not fit this version of cnpgen.
+        PluginError: A package that they need is not installed.
+    """
+    tables = [dict(stage) for stage in stages]
+    if missing := missing_kinds(registry.STAGES, list(enumerate(tables))):
+        raise PluginError(missing)
+    mistakes = list[str]()
+    read = partial(read_kind, registry.STAGES)
+    made = [read(table, Place(name) / "stage" / at, mistakes) for at, table in enumerate(without_defaults(tables))]
+    if mistakes:
+        raise RecipeError(mistakes)
+    return Pipeline(name=name, problem=problem, stage=tuple(made), path=Path(name))

@@ -55,7 +55,10 @@ class Piece:
         if end < self.first:
             return False
         skip = min(max(self.first - made, 0), len(taken))
-        attempts = self._tally.count(draws, taken, first=skip, last=end == self.stop)
+        final = draws.last and end == made + len(draws.alive)  # no other piece counts the draws after the last row
+        attempts = self._tally.count(draws, taken, first=skip, last=end == self.stop and not final)
+        if final:
+            attempts[-1:] += self._tally.waiting
         part = {field.name: draws[field.name][:, skip : len(taken)] for field in self._fields[:-2]}
         self._parts.append({**part, "attempts": attempts[None]})
         return end == self.stop

@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.kernels.library import Backend, problem_kernels
+from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.piece import Block, Piece
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Array, Round
 from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import EXACTNESS
-from cnpgen.problems.robot import load_robot
 from cnpgen.store.field import Field
 
 HOPELESS = 1e-4  # acceptance below which a pipeline is given up, once it has had a fair chance
@@ -36,22 +35,24 @@ class PreparedPipeline:
         context: Problem, robot and kernels.
         fields: The fields of a row, in stored order.
         block_rows: Rows per block.
+        tasks: How many draws there are at all, all in one block; None where they never end.
+
+    Raises:
+        RecipeError: The stages do not fit together, or to the problem.
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
         if dtype not in list(EXACTNESS):
             raise UsageError(f"dtype must be {' or '.join(map(repr, EXACTNESS))}, got {dtype!r}")
-        problem = pipeline.problem
-        robot = load_robot(problem)
-        kernels = problem_kernels(problem, robot, backend, cache_folder)
         self.pipeline = pipeline
-        self.block_rows = min(stage.block_rows for stage in pipeline.stage)
-        self.context = Context(problem, robot, kernels, dtype)
+        self.tasks = listed_tasks(pipeline)
+        self.block_rows = min(stage.block_rows for stage in pipeline.stage) if self.tasks is None else self.tasks
+        self.context = load_context(pipeline.problem, backend, cache_folder, dtype)
         steps = steps_of(pipeline)
         self.fields = stored_fields(steps, self.context)
         written = written_columns(pipeline.path, steps, self.context)
-        with kernels.compiling_together():
-            self._stages = prepare_steps(steps, self.context)
+        with self.context.kernels.compiling_together():
+            self._stages = prepare_steps(steps, lambda stage: stage.prepare(self.context))
             self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
@@ -89,6 +90,7 @@ class PreparedPipeline:
         waiting = deque(Piece(self.fields, first, stop) for first, stop in ranges)
         made = tried = 0
         while waiting:
+            self._check_left(tried, made, waiting[-1].stop, index)
             draws = self._round(random, self._round_size(made, tried))
             tried += draws.size
             while waiting and waiting[0].take(draws, made):
@@ -98,7 +100,7 @@ class PreparedPipeline:
                 self._check_hope(draws, made, tried)
 
     def _round(self, random: np.random.Generator, size: int) -> Round:
-        draws = Round(size)
+        draws = Round(size, last=self.tasks is not None)
         for label, work in self._stages:
             draws.stage = label
             work(draws, random)
@@ -116,12 +118,25 @@ class PreparedPipeline:
         It depends on the block alone and not on how many of its rows are wanted.
         """
         rows = self.block_rows
+        if self.tasks is not None:
+            return self.tasks
         if tried == 0:
             return rows // 2
         if made == 0:
             return 2 * rows
         missing = (rows - made) * tried / made
         return int(np.clip(np.ceil(1.03 * missing) + rows // 128, rows // 16, 2 * rows))
+
+    def answers(self, seed: int) -> Round:
+        """Return all listed tasks, those without an answer rejected."""
+        assert self.tasks is not None
+        return self._round(random_generator(seed, "", 0), self.tasks)
+
+    def _check_left(self, tried: int, made: int, wanted: int, index: int) -> None:
+        """Refuse to make more rows than there are answers to listed tasks."""
+        if self.tasks is not None and (tried or index):
+            found = f"{made} of its {self.tasks} tasks have an answer" if tried else f"it lists {self.tasks} tasks"
+            raise UsageError(f"{self.pipeline.name}: {found}, {index * self.block_rows + wanted} rows are asked for")
 
     def _check_hope(self, draws: Round, made: int, tried: int) -> None:
         if tried >= FAIR_CHANCE and made < HOPELESS * tried:
@@ -130,6 +145,18 @@ class PreparedPipeline:
             reasons = ", ".join(f"{reason} ({count / draws.size:.1%})" for count, reason in worst if count)
             text = f"{made} of {tried:,} draws were accepted; of the last {draws.size:,}, rejected for {reasons}"
             raise RecipeError([f"{self.pipeline.path}: {text}"])
+
+
+def listed_tasks(pipeline: Pipeline) -> int | None:
+    """Return how many draws there are where a stage lists them; None where none does.
+
+    Raises:
+        RecipeError: More than one stage lists them.
+    """
+    listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
+    if len(listed) > 1:
+        raise RecipeError([f"{pipeline.path}: {len(listed)} stages list positions, expected one at most"])
+    return listed[0] if listed else None
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:

@@ -1,6 +1,6 @@
 """The stages of a pipeline, one after the other: what they are called, whether they fit together, and their work."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,8 +112,12 @@ def written_columns(path: Path, steps: Sequence[Step], context: Context) -> set[
     return written
 
 
-def prepare_steps(steps: Sequence[Step], context: Context) -> list[tuple[str, Work]]:
+def prepare_steps(steps: Sequence[Step], prepare: Callable[[Stage], Work]) -> list[tuple[str, Work]]:
     """Prepare and label every stage.
+
+    Args:
+        steps: The stages.
+        prepare: What prepares one.
 
     Raises:
         RecipeError: With all their mistakes at once, each with file and stage.
@@ -121,7 +125,7 @@ def prepare_steps(steps: Sequence[Step], context: Context) -> list[tuple[str, Wo
     works, mistakes = [], []
     for step in steps:
         try:
-            works.append((step.label, step.stage.prepare(context)))
+            works.append((step.label, prepare(step.stage)))
         except RecipeError as error:
             mistakes += [step.says(mistake) for mistake in error.mistakes]
     if mistakes:

@@ -19,12 +19,13 @@ class Tally:
     Attributes:
         tried: Draws counted so far.
         accepted: Rows taken so far.
+        waiting: Draws since the last accepted one.
     """
 
     def __init__(self, fields: tuple[Field, ...]) -> None:
         self.tried = 0
         self.accepted = 0
-        self._waiting = 0  # draws since the last accepted one
+        self.waiting = 0
         self._rejections: dict[str, int] = {}
         self._stages: dict[str, str] = {}
         self._maps = [field for field in fields if field.name.endswith("_xyz")]
@@ -47,7 +48,7 @@ class Tally:
         start = int(taken[first - 1]) + 1 if first else 0
         stop = int(taken[-1]) + 1 if last else draws.size
         if first:
-            self._waiting = 0
+            self.waiting = 0
         fates = np.bincount(draws.fate[start:stop], minlength=1 + len(draws.reasons))
         for reason, number in zip(draws.reasons, fates[1:].tolist(), strict=True):
             self._rejections[reason] = self._rejections.get(reason, 0) + number
@@ -58,8 +59,8 @@ class Tally:
             cells = _cells(draws.drawn[field.name][:, start:stop], field)
             self._drawn[field.name] += np.bincount(cells, minlength=CELLS * CELLS)
             self._kept[field.name] += np.bincount(cells[wanted - start], minlength=CELLS * CELLS)
-        attempts = np.diff(wanted, prepend=start - 1 - self._waiting).astype(np.int64)
-        self._waiting = stop - 1 - int(wanted[-1]) if len(wanted) else self._waiting + stop - start
+        attempts = np.diff(wanted, prepend=start - 1 - self.waiting).astype(np.int64)
+        self.waiting = stop - 1 - int(wanted[-1]) if len(wanted) else self.waiting + stop - start
         return attempts
 
     def fates(self) -> Fates:

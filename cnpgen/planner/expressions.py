@@ -1,4 +1,4 @@
-"""What a planner computes with kernels: tip positions, equalities of the manifold, what slowing down helps against."""
+"""What a planner computes with kernels: equalities of the manifold, what slowing down helps against."""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -10,20 +10,12 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics, symbols
+from cnpgen.symbolic.state import SymbolicState, Vec, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-
-
-def tip_position(robot: "Robot") -> Any:
-    """Build ``q -> p``, the tip's position [m]."""
-    import casadi as ca
-
-    q_sx, q = symbols("q", robot.n)
-    return ca.Function("tip_position", [q_sx], [ca.vertcat(*forward_kinematics(robot.chain, q).tip)])
 
 
 def equality_residuals(robot: "Robot", problem: Problem) -> Any:

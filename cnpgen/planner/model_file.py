@@ -1,7 +1,9 @@
 """Writing and reading models, and finding those that cnpgen ships."""
 
 import json
+import math
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,16 +11,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, UsageError, nearest
+from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.architecture import Architecture
-from cnpgen.planner.network.features import BLOCKS, Features
+from cnpgen.planner.network.features import BLOCKS, Features, count_features
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
+from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, check_form
 from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
 from cnpgen.store.paths import require_file
 
 KIND, VERSION = "cnpgen-model", 1
+FIXED_POINTS = 5  # of p: three at the start, two at the goal, whose acceleration models leave free
+MOST_STEPS = 20  # of Gauss-Newton, each of which makes a kernel larger
+_FORM = {
+    "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
+    "features": [TEXT],
+    "meaning": {"path_scale": NUMBER, "bending_steps": WHOLE, "landing_steps": WHOLE},
+    "rest": [TEXT],
+}
+_TRAINING = {"dataset": {EVERY: ANYTHING}, "stages": [{EVERY: ANYTHING}]}  # what is read of it, where it is there
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -107,28 +120,66 @@ def model_from_content(path: Path, content: Content) -> Model:
     """
     try:
         return _assembled(content)
-    except (KeyError, TypeError, ValueError, UsageError) as error:
+    except KeyError as error:
+        raise DatasetError(f"{path} does not fit this version of cnpgen: it has no {error}") from error
+    except (TypeError, ValueError, UsageError, RecipeError) as error:
         raise DatasetError(f"{path} does not fit this version of cnpgen: {error}") from error
 
 
 def _assembled(content: Content) -> Model:
-    description = json.loads(content.texts["description"])
+    """Put a model together; what it says of itself is compared with its arrays before anything is made of it."""
+    description, training = (parse_json(content.texts[name]) for name in ("description", "training"))
+    check_form(description, _FORM)
+    check_form(training, {EVERY: ANYTHING})
+    check_form(training, {key: form for key, form in _TRAINING.items() if key in training})
+    problem = ProblemRecord(content.texts["problem_recipe"], content.texts["problem_urdf"])
     architecture = Architecture(**description["architecture"])
-    parameters = np.empty(architecture.n_parameters, np.float32)
-    for layer in architecture.all_layers:
-        layer.weight(parameters)[:] = content.arrays[f"{layer.name}_weight"]
-        layer.bias(parameters)[:] = content.arrays[f"{layer.name}_bias"]
-    unknown = set(description["features"]) - set(BLOCKS)
-    if unknown:
-        raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
+    meaning = Meaning(**description["meaning"])
+    _check_sizes(problem, architecture, features)
+    if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
+        raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
     return Model(
-        problem=ProblemRecord(content.texts["problem_recipe"], content.texts["problem_urdf"]),
+        problem=problem,
         architecture=architecture,
-        parameters=parameters,
+        parameters=_parameters(architecture, content.arrays),
         features=features,
-        meaning=Meaning(**description["meaning"]),
+        meaning=meaning,
         rest=tuple(description["rest"]),
-        training=json.loads(content.texts["training"]),
+        training=training,
         log=content.texts["log"],
     )
+
+
+def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: Features) -> None:
+    """Refuse a network whose inputs and outputs are not those of its features and its problem."""
+    unknown = set(features.blocks) - set(BLOCKS)
+    if unknown:
+        raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
+    joints, spec = len(problem.joint_names), problem.trajectory
+    expected = (
+        count_features(features.blocks, joints),
+        (spec.path_control_points - FIXED_POINTS) * joints,
+        spec.rate_control_points,
+    )
+    found = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
+    if found != expected:
+        raise ValueError(f"the network has {found} inputs, path outputs and rate outputs, expected {expected}")
+    for name in ("mean", "scale"):
+        shape = getattr(features, name).shape
+        if shape != (architecture.inputs,):
+            raise ValueError(f"feature_{name} must have shape ({architecture.inputs},), got {shape}")
+
+
+def _parameters(architecture: Architecture, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+    """Join the arrays of all layers, each of which must be there in its shape."""
+    if architecture.layers > len(arrays):
+        raise ValueError(f"{architecture.layers} layers cannot be in {len(arrays)} arrays")
+    parts = []
+    for layer in architecture.all_layers:
+        for name, shape in (("weight", (layer.inputs, layer.outputs)), ("bias", (layer.outputs,))):
+            values = arrays[f"{layer.name}_{name}"]
+            if values.shape != shape:
+                raise ValueError(f"{layer.name}_{name} must have shape {shape}, got {values.shape}")
+            parts.append(values.ravel())
+    return np.concatenate(parts).astype(np.float32)

@@ -11,9 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
+from cnpgen.pipelines.completion import Completion
+from cnpgen.planner.keeping import keep_what_is_faster
 from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
+from cnpgen.planner.strike import MEETING, State, Strikes, boundary_of_tasks, load_completion, strike_tasks
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.schema.arguments import numbers
@@ -59,6 +62,7 @@ class Planner:
             velocity, acceleration = given.robot.velocity_limit, given.robot.acceleration_limit
             self._still = {"start_dq": AT_REST * velocity, "start_ddq": AT_REST * acceleration}
             self._still["goal_dq"] = self._still["start_dq"]
+        self._completion: Completion | None = None
 
     def __repr__(self) -> str:
         return f"<Planner for {self.model.problem.name!r}: a network of {self.model.architecture}>"
@@ -121,11 +125,51 @@ class Planner:
         warn_of_far_joints(self.robot, boundary)
         return self._kit.plan(self.model, self._rested(boundary), sample_id=sample_id, columns=columns)
 
+    @one_thread()
+    def strike(
+        self,
+        state: State,
+        puck: ArrayLike,
+        towards: ArrayLike,
+        *,
+        meeting: float = MEETING,
+        speed_share: ArrayLike = 1.0,
+    ) -> Strikes:
+        """Plan hits: from where the arm is, to the puck, so that it goes where it is to go.
+
+        The stages that completed the rows which the model was trained on find the goal configuration and velocity
+        (``cnpgen.complete`` does the same in files). They are loaded at the first strike.
+
+        Args:
+            state: Where the arm is: positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,) or
+                (N, n) each, as ``states_at`` gives them; off the table by no more than motions may be.
+            puck: Where the puck's centre is, x and y [m], shape (2,) or (N, 2); with its z [m] where there is no table.
+            towards: Where it is to go, x and y [m], shape (2,) or (N, 2).
+            meeting: From the puck's centre to the mallet's when they meet [m].
+            speed_share: Speed of the hit as a fraction of the highest possible one, a number or shape (N,).
+
+        Returns:
+            Plans for the strikes that have an answer, not checked yet, and why the others have none.
+
+        Raises:
+            UsageError: A shape is wrong, something is not finite, or the model was not trained on hits.
+        """
+        if self._completion is None:
+            self._completion = load_completion(self.model, self._options["backend"])
+        tasks = strike_tasks(self._completion, state, puck, towards, meeting=meeting, share=speed_share)
+        columns = {name: tasks[name][0] for name in ("hit_angle", "hit_speed")}
+        boundary = self._rested(boundary_of_tasks(tasks))
+        return Strikes(self._kit.plan(self.model, boundary, sample_id=tasks.alive, columns=columns), tasks.why())
+
     def replan(self, plans: Plans, time: ArrayLike, *, goal_q: ArrayLike, goal_dq: ArrayLike | None = None) -> Plans:
         """Plan on from points on plans that are being executed: q, dq and ddq go on without a jump.
 
         At its very end a plan may still accelerate, because goal accelerations are free. What follows a motion that
         ends at rest begins at rest: ``plan`` from its goal.
+
+        To a goal that has not moved no plan takes longer than what was left: where the network's is not faster by 2 %,
+        it is the rest of the old plan, with exact ends and the same duration, written anew. Where accelerations would
+        differ by more than 0.1 % of the limits, all plans that are returned have two or three spans for each of theirs.
 
         Args:
             plans: One plan or N, by any planner of the same robot.
@@ -138,7 +182,9 @@ class Planner:
             UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
         """
         q, dq, ddq = states_at(plans, time)
-        return self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
+        new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
+        times = np.broadcast_to(numbers("time", time), (len(plans),))
+        return keep_what_is_faster(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
     def _rested(self, boundary: Boundary) -> Boundary:
         """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.curves import line_bend
-from cnpgen.planner.expressions import tip_position
 from cnpgen.planner.tasks import Tasks, expected_time
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.symbolic.state import tip_position
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class Preparation:
     Attributes:
         problem: The problem.
         velocity_limit: Planning limits [rad/s], shape (n,).
-        tip: Kernel of ``expressions.tip_position``.
+        tip: Kernel of ``symbolic.state.tip_position``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
     """
 

@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import ATTRIBUTES, BOUNDARY
+from cnpgen.plans.format import FORMAT as PLANS
+from cnpgen.plans.format import FORMAT_VERSION as PLANS_VERSION
 from cnpgen.plans.load import stored_problem
 from cnpgen.problems.record import ProblemRecord, as_record
 from cnpgen.store.blueprint import Blueprint, load_blueprint
-from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.sealed import has_seal
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.store.shard import FORMAT
 from cnpgen.trajectory.boundary import Boundary
@@ -22,6 +25,7 @@ from cnpgen.trajectory.boundary_arguments import boundary_of
 CONTEXT = ("hit_angle", "hit_speed")  # columns of a dataset that plans keep
 CONDITIONS = (*BOUNDARY, "goal_ddq")
 ASKED = (*CONDITIONS, "sample_id", *CONTEXT)
+SAID = (*ATTRIBUTES, "plan_fingerprint", "recipe_sha256")  # attributes, the last two of shards
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class BoundaryFile:
 
     Attributes:
         path: The file.
-        attributes: Its attributes.
+        attributes: Those of ``SAID`` that it has.
         columns: Those of ``ASKED`` that it has: name -> values.
     """
 
@@ -103,9 +107,10 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     require_file(path, "a dataset or an HDF5 file of boundary conditions")
     if (kind := file_kind(path)).endswith(" of cnpgen"):
         raise DatasetError(f"{path} is {kind}, not an HDF5 file of boundary conditions")
-    with opened_foreign_hdf5(path) as file:
-        attributes = dict(file.attrs.items())
-        columns = {name: np.asarray(file[name][()]) for name in ASKED if name in file}
+    has_seal(path, kind=PLANS, version=PLANS_VERSION)
+    with opened_hdf5(path) as file:
+        attributes = file.attributes.some(SAID)
+        columns = {name: file[name].read() for name in ASKED if name in file}
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
         raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan")

@@ -4,7 +4,7 @@ Rows of a certified dataset have their plans already.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from cnpgen.store.blueprint import Blueprint
-
-Array = NDArray[np.float64]
 
 
 def load_boundary_problems(
@@ -116,7 +114,7 @@ def _of_file(path: Path, wanted: ProblemRecord | None) -> Plans:
         raise DatasetError(f"{path}: {error}") from error
 
 
-def plans_of_rows(problem: ProblemRecord, columns: "Mapping[str, Array]", *, source: str = "") -> Plans:
+def plans_of_rows(problem: ProblemRecord, columns: "Mapping[str, NDArray[Any]]", *, source: str = "") -> Plans:
     """Return rows of a dataset as plans: with those of a certified dataset, else with control points of nan.
 
     Args:

@@ -69,6 +69,7 @@ class Evaluation:
             "format_version": FORMAT_VERSION,
             "problem": record.name,
             "problem_sha256": record.comparable_sha256,
+            "checksum": "right" if self.plans.sealed else "none",
             "step_s": self.step,
             **summarise(self.verdicts),
         }
@@ -82,7 +83,7 @@ class Evaluation:
 def evaluate_plans(
     plans: Plans, *, step: float = STEP, workers: int | None = None, progress: Callable[[int], None] | None = None
 ) -> Evaluation:
-    """Judge plans with Pinocchio and Coal on a fine time grid.
+    """Judge plans with Pinocchio and Coal, on a fine time grid and between its moments.
 
     Every plan is judged for itself: neither the others nor the number of processes change its verdict. Plans that
     cannot be evaluated get a verdict that says so. Where a column ``start_xyz`` or ``goal_xyz`` is not where the joints

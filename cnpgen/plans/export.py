@@ -10,6 +10,7 @@ import numpy as np
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.formats import Sampled, csv_table, joint_trajectory, sample_plan, write_npz
+from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans, check_plans_type, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files.atomic import write_file
@@ -42,7 +43,7 @@ class Exported:
 
 
 def export_plans(
-    plans: Plans, out: str | Path, *, to: Form, rate: float = 1000.0, only: Sequence[int] | None = None
+    plans: Plans | JoinedPlans, out: str | Path, *, to: Form, rate: float = 1000.0, only: Sequence[int] | None = None
 ) -> Exported:
     """Sample plans in time and write them; files that are there are replaced.
 
@@ -59,7 +60,7 @@ def export_plans(
     Plans that cannot be sampled are left out, and said to be.
 
     Args:
-        plans: The plans.
+        plans: The plans, or what ``join_plans`` made of them.
         out: The file to write for "npz" (in a folder that exists: ``plans.npz``), else a folder, which is made.
         to: The form.
         rate: Samples per second [Hz]; the last instant of a plan is always one of its samples.
@@ -70,7 +71,8 @@ def export_plans(
         DatasetError: None of the plans can be exported.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    check_plans_type(plans)
+    if not isinstance(plans, JoinedPlans):
+        check_plans_type(plans)
     if to not in FORMS:
         raise UsageError(f"plans can be exported to {', '.join(FORMS)}, got {to!r}")
     if not 0 < rate <= HIGHEST_RATE:
@@ -87,7 +89,7 @@ def export_plans(
     return Exported(files, len(kept), refused, invalid, held)
 
 
-def _chosen(plans: Plans, only: Sequence[int] | None) -> list[int]:
+def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]:
     """Return the indices of the plans that are wanted, ascending."""
     chosen = sorted(set(range(len(plans)) if only is None else only))
     for index in chosen:
@@ -96,9 +98,10 @@ def _chosen(plans: Plans, only: Sequence[int] | None) -> list[int]:
     return chosen
 
 
-def _refused(plans: Plans, rate: float, chosen: list[int]) -> dict[int, str]:
+def _refused(plans: Plans | JoinedPlans, rate: float, chosen: list[int]) -> dict[int, str]:
     """Find the plans that cannot be sampled: index -> why."""
-    statuses, found = screen(plans), {}
+    unknown = np.full(len(plans), PlanStatus.UNKNOWN, np.uint8)  # parts that cannot be evaluated cannot be joined
+    statuses, found = unknown if isinstance(plans, JoinedPlans) else screen(plans), {}
     for index in chosen:
         why = _why_not(plans, index, PlanStatus(statuses[index]), rate)
         if why:
@@ -106,7 +109,7 @@ def _refused(plans: Plans, rate: float, chosen: list[int]) -> dict[int, str]:
     return found
 
 
-def _why_not(plans: Plans, index: int, status: PlanStatus, rate: float) -> str:
+def _why_not(plans: Plans | JoinedPlans, index: int, status: PlanStatus, rate: float) -> str:
     duration = plans.duration[index]
     if status != PlanStatus.UNKNOWN:
         return status.text
@@ -114,18 +117,18 @@ def _why_not(plans: Plans, index: int, status: PlanStatus, rate: float) -> str:
         return f"it lasts {duration:.3g} s, less than a nanosecond"
     if duration * rate > MOST_SAMPLES:
         return f"it lasts {duration:.3g} s: more than {MOST_SAMPLES} samples at {rate:g} Hz"
-    if not np.isfinite(plans.motion[[index]].at(np.linspace(0, 1, 101)).jerk).all():
+    if not np.isfinite(plans.motion[[index]].at_times(np.linspace(0, duration, 101)[None]).jerk).all():
         return "its derivatives are too large to compute with"
     return ""
 
 
-def _sampled(plans: Plans, rate: float, kept: list[int]) -> Iterator[tuple[int, Sampled]]:
+def _sampled(plans: Plans | JoinedPlans, rate: float, kept: list[int]) -> Iterator[tuple[int, Sampled]]:
     motion = plans.motion
     for index in kept:
         yield index, sample_plan(motion[[index]], rate)
 
 
-def _write_npz(out: Path, plans: Plans, rate: float, kept: list[int]) -> tuple[Path, ...]:
+def _write_npz(out: Path, plans: Plans | JoinedPlans, rate: float, kept: list[int]) -> tuple[Path, ...]:
     path = out / "plans.npz" if out.is_dir() else out
     held = plans.problem.held_joints
     about = {
@@ -139,7 +142,7 @@ def _write_npz(out: Path, plans: Plans, rate: float, kept: list[int]) -> tuple[P
     return (path,)
 
 
-def _write_each(out: Path, plans: Plans, rate: float, kept: list[int], to: Form) -> tuple[Path, ...]:
+def _write_each(out: Path, plans: Plans | JoinedPlans, rate: float, kept: list[int], to: Form) -> tuple[Path, ...]:
     """Write one file per plan."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder")
@@ -151,7 +154,7 @@ def _write_each(out: Path, plans: Plans, rate: float, kept: list[int], to: Form)
     return tuple(files)
 
 
-def _write_held_joints(folder: Path, plans: Plans) -> Path | None:
+def _write_held_joints(folder: Path, plans: Plans | JoinedPlans) -> Path | None:
     """Say where the joints stay that move and are not planned."""
     held = plans.problem.held_joints
     if not held:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.store.files.atomic import committing
+from cnpgen.trajectory.joined import JoinedMotion
 from cnpgen.trajectory.motion import Motion
 
 Array = NDArray[np.float64]
@@ -45,12 +46,12 @@ class Sampled:
     jerk: Array
 
 
-def sample_plan(motion: Motion, rate: float) -> Sampled:
+def sample_plan(motion: Motion | JoinedMotion, rate: float) -> Sampled:
     """Sample one motion at ``rate`` [Hz], and at its last instant."""
     duration = float(motion.duration()[0])
     count = max(math.ceil(duration * rate - LEAST_STEP), 1)
     t = np.append(np.arange(count) / rate, duration)
-    states = motion.at(motion.phase_at(t[None]))
+    states = motion.at_times(t[None])
     return Sampled(t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
 
 

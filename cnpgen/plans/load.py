@@ -17,7 +17,8 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord, as_record, record_problem
 from cnpgen.store.blueprint import StoredProblem
-from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+from cnpgen.store.files.hdf5 import Column, Hdf5, opened_hdf5
+from cnpgen.store.files.sealed import has_seal
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary
 
@@ -27,7 +28,8 @@ Array = NDArray[np.float64]
 def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:
     """Read plans from a file that cnpgen or anybody else has written.
 
-    Names, shapes and types must be right. Values need not be: every plan is judged for itself, later.
+    Names, shapes and types must be right. Values need not be: every plan is judged for itself, later. The checksum that
+    cnpgen writes is compared; files of others have none, and ``sealed`` of the plans says which it was.
 
     Args:
         path: The file.
@@ -45,8 +47,9 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
     require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
     if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
         raise DatasetError(f"{path} is {kind}, not a file of plans")
-    with opened_foreign_hdf5(path) as file:
-        attributes = {name: file.attrs[name] for name in (*ATTRIBUTES, *NOTES) if name in file.attrs}
+    sealed = has_seal(path, kind=FORMAT, version=FORMAT_VERSION)
+    with opened_hdf5(path) as file:
+        attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
         columns = _columns(path, file)
     record = agreed_problem(path, stored_problem(path, attributes), wanted, content="plans", command="evaluate")
@@ -54,31 +57,27 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
         plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
         raise DatasetError(f"{path}: {error}") from error
-    return settle_tips(plans, where=f"{path}: ")
+    return settle_tips(replace(plans, sealed=sealed), where=f"{path}: ")
 
 
-def _columns(path: Path, file: Any) -> dict[str, NDArray[Any]]:
+def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
     """Read the datasets of a file."""
-    columns = {}
-    for name, item in file.items():
-        if item is None:  # what h5py makes of a link to something that cannot be read
-            raise DatasetError(f"{path} is damaged: its {name!r} cannot be read")
-        if hasattr(item, "dtype"):
-            columns[name] = _read(path, name, item)
+    columns = {name: _read(path, name, item) for name, item in file.columns().items()}
     missing = [name + nearest(name, columns.keys() - {*REQUIRED}) for name in REQUIRED if name not in columns]
     if missing:
         raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
     if "status" in columns:
-        columns["status"] = _statuses(path, columns["status"], dict(file["status"].attrs))
+        named = file["status"].attributes.some(("flag_values", "flag_meanings"))
+        columns["status"] = _statuses(path, columns["status"], named)
     return columns
 
 
-def _read(path: Path, name: str, dataset: Any) -> NDArray[Any]:
+def _read(path: Path, name: str, dataset: Column) -> NDArray[Any]:
     """Read a dataset in the type that it must have."""
     what, kinds = ("integers", "iu") if name in INTEGERS else ("floats", "f") if name in FLOATS else ("numbers", "fiu")
     if dataset.dtype.kind not in kinds:
         raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
-    values = dataset[()]
+    values = dataset.read()
     if name not in INTEGERS:
         return np.asarray(values, np.float64)
     if values.size and values.max() > np.iinfo(np.int64).max:
@@ -174,8 +173,8 @@ def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
     record = ProblemRecord(_text(path, attributes, "problem_recipe"), _text(path, attributes, "problem_urdf"))
     try:
         same = record.comparable_sha256 == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{path} is damaged: its problem_recipe is not that of a problem: {error}") from error
+    except RecipeError as error:
+        raise DatasetError(f"{path} is damaged: its attribute 'problem_recipe': {error}") from error
     if not same:
         raise DatasetError(f"{path} is damaged: its problem was changed after it was written")
     return record

@@ -20,6 +20,7 @@ from cnpgen.schema.arguments import integer, numbers
 from cnpgen.store.blueprint import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spec import MOST_DEGREE, MOST_POINTS
 
 Array = NDArray[np.float64]
 
@@ -41,6 +42,7 @@ class Plans:
         status: What is known of every plan, values of ``PlanStatus``, shape (N,).
         source: Where they are from, a line of text, or nothing.
         refined_with: The options that they were refined with, as JSON, or nothing.
+        sealed: Whether they are from a file with a checksum, which was right.
     """
 
     problem: ProblemRecord
@@ -53,9 +55,10 @@ class Plans:
     status: NDArray[np.uint8]
     source: str = ""
     refined_with: str = ""
+    sealed: bool = False
 
     def __post_init__(self) -> None:
-        integer("degree", self.degree, least=3)
+        integer("degree", self.degree, least=3, most=MOST_DEGREE)
         mistake = next(_mistakes(self), None)
         if mistake:
             raise UsageError(mistake)
@@ -236,6 +239,9 @@ def _mistakes(plans: Plans) -> Iterator[str]:
     fewest = max(degree + 2, 3 + plans.boundary.fixed_at_goal)
     if points < fewest:
         yield f"path_control_points must have at least {fewest} of degree {degree}, got shape {path.shape}"
+    most = max(points, rate.shape[-1] if rate.ndim else 0)
+    if most > MOST_POINTS:
+        yield f"splines have at most {MOST_POINTS} control points, got {most}"
     if rate.ndim != 2 or len(rate) != rows or rate.shape[1] <= degree:
         yield f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}"
     for name, values in vars(plans.boundary).items():

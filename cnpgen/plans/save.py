@@ -14,12 +14,14 @@ from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.hdf5 import create_hdf5
-from cnpgen.store.paths import PLANS, file_kind
+from cnpgen.store.files.kind import PLANS
+from cnpgen.store.files.sealed import BLOCK, under_seal
+from cnpgen.store.paths import file_kind
 from cnpgen.store.shard import field_attributes
 
 
 def save_plans(path: str | Path, plans: Plans) -> None:
-    """Write plans to a file, atomically; equal plans give equal bytes.
+    """Write plans to a file with a checksum, atomically; equal plans give equal bytes.
 
     Args:
         path: Where to; a file of plans that is there is replaced, and folders that are missing are made (which
@@ -36,14 +38,14 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     check_replaceable(Path(path))
     buffer = io.BytesIO()
     fields = plan_fields(plans.problem.joint_names)
-    with h5py.File(create_hdf5(buffer)) as file:
+    with h5py.File(create_hdf5(buffer, userblock=BLOCK)) as file:
         for name, values in _datasets(plans).items():
             dataset = file.create_dataset(name, data=values, track_times=False)
             _write_attributes(dataset, field_attributes(fields[name]) if name in fields else {})
         file["status"].attrs["flag_values"] = np.array(list(PlanStatus), np.uint8)
         _write_attributes(file["status"], {"flag_meanings": " ".join(status.name.lower() for status in PlanStatus)})
         _write_attributes(file, _attributes(plans))
-    write_file(Path(path), buffer.getvalue())
+    write_file(Path(path), under_seal(buffer.getvalue(), kind=FORMAT, version=FORMAT_VERSION))
 
 
 def check_replaceable(path: Path) -> None:

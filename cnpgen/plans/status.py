@@ -20,7 +20,7 @@ class PlanStatus(IntEnum):
         """The status in words."""
         return {
             PlanStatus.UNKNOWN: "not checked yet",
-            PlanStatus.VALID: "meets every constraint and its boundary conditions on a fine time grid",
+            PlanStatus.VALID: "meets every constraint and its boundary conditions at every moment",
             PlanStatus.INVALID: "breaks a constraint or a boundary condition",
             PlanStatus.NOT_FINITE: "a boundary condition or a control point is not a finite number",
             PlanStatus.NOT_FORWARD: "the rate ds/dt is not positive throughout: the motion never arrives",

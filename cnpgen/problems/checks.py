@@ -1,11 +1,12 @@
 """What a problem file must say that is about several of its tables, or about the URDF beside it."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
-from cnpgen.errors import nearest
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
 from cnpgen.schema.units import show
 
@@ -28,13 +29,13 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
     if not isinstance(urdf, str):
         return
     path = folder / urdf
-    if not path.is_file():
+    if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
         yield (where / "urdf").says(f"no such file: {path}{hint}")
         return
     try:
-        tree = ElementTree.parse(path)  # noqa: S314 - a user's own file, and expat expands no external entities
-    except (OSError, ElementTree.ParseError):
+        tree = urdf_tree(read_urdf(path))
+    except (RecipeError, ValueError):  # whoever loads the robot says so
         return
     moving = [joint.get("name", "") for joint in tree.iter("joint") if joint.get("type", "fixed") != "fixed"]
     for name in joints if isinstance(joints, list) else ():

@@ -12,6 +12,7 @@ from typing import Any
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.robots.spec import HeldObject, LimitSpec, Obstacle, RobotSpec
+from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.keys import NAME, field, to_dict
 from cnpgen.trajectory.spec import TrajectorySpec
@@ -73,10 +74,9 @@ class Problem:
         """The URDF, read once: the robot, its kernels and the identity are of one text, whatever becomes of the file.
 
         Raises:
-            OSError: The file cannot be read.
-            UnicodeDecodeError: It is not in UTF-8.
+            RecipeError: The file cannot be read, or is not UTF-8.
         """
-        return self.urdf_path.read_bytes().decode()
+        return read_urdf(self.urdf_path)
 
     @cached_property
     def identity(self) -> str:

@@ -9,16 +9,19 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load import load_problem_behind, restore_problem
 from cnpgen.problems.problem import Problem, resolved
+from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.keys import Place
+from cnpgen.schema.parsing import parse
 from cnpgen.store.blueprint import StoredProblem
-from cnpgen.store.files.documents import canonical_sha256, differences, plain
+from cnpgen.store.files.documents import canonical_sha256, differences, parse_json, plain
+from cnpgen.store.files.forms import EVERY, NUMBER, TEXT, WHOLE, check_form
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -27,6 +30,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _MOVING = ("revolute", "continuous", "prismatic")
+_FORM = {
+    "name": TEXT,
+    "robot": {"urdf": TEXT, "joints": [TEXT], "tip": TEXT, "base": [NUMBER]},
+    "limits": {EVERY: NUMBER},
+    "constraint": [{"use": TEXT}],
+    "trajectory": {EVERY: WHOLE},
+}
 _JUDGED_BY = ("tolerance", "budget", "weight")  # how strictly a plan is judged, not what it is a plan for
 
 
@@ -42,11 +52,13 @@ class ProblemRecord(StoredProblem):
         """The resolved problem, as ``cnpgen.problems.problem.resolved`` returns it.
 
         Raises:
-            ValueError: The text is not the JSON of a problem.
+            RecipeError: The text is not the JSON of a problem.
         """
-        content = json.loads(self.recipe)
-        if not isinstance(content, dict) or not {"name", "robot", "constraint"} <= content.keys():
-            raise ValueError("the recipe is not that of a problem")
+        try:
+            content: dict[str, Any] = parse_json(self.recipe)
+            check_form(content, _FORM)
+        except ValueError as error:
+            raise RecipeError([f"the recipe is not that of a problem: {error}"]) from error
         return content
 
     @property
@@ -62,14 +74,23 @@ class ProblemRecord(StoredProblem):
     @property
     def held_joints(self) -> dict[str, float]:
         """Joints of the URDF that move and are not planned -> where they stay [rad or m]: at zero."""
-        joints = ElementTree.fromstring(self.urdf.encode()).iter("joint")  # noqa: S314 - expat expands no external entity
+        joints = urdf_tree(self.urdf).iter("joint")
         moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
         return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
 
     @property
     def trajectory(self) -> TrajectorySpec:
-        """Parameterisation that the problem suggests."""
-        return TrajectorySpec(**self.content["trajectory"])
+        """Parameterisation that the problem suggests.
+
+        Raises:
+            RecipeError: There is no such parameterisation.
+        """
+        mistakes: list[str] = []
+        where = Place("the recipe of the problem", "trajectory")
+        spec = parse(TrajectorySpec, self.content["trajectory"], where=where, mistakes=mistakes)
+        if spec is None:
+            raise RecipeError(mistakes)
+        return spec
 
     @cached_property
     def comparable_sha256(self) -> str:
@@ -108,7 +129,7 @@ class ProblemRecord(StoredProblem):
 
         _, robot = open_problem(self)
         model = robot.model
-        data, frame = model.createData(), model.getFrameId(robot.tip)
+        data, frame = model.createData(), robot.tip_frame
         found = np.empty((len(q), 3))
         for row, configuration in enumerate(q):
             pin.forwardKinematics(model, data, configuration)

@@ -7,7 +7,6 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import chain_from_model
-from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.robot import Robot, reduced_model
 
 
@@ -19,8 +18,7 @@ def load_robot(problem: Problem) -> Robot:
     """
     spec, limits = problem.robot, problem.limits
     try:
-        urdf = _urdf_text(problem)
-        check_mimic(urdf, spec.joints)
+        urdf = problem.urdf_text
         model = reduced_model(problem.urdf_path, urdf, spec.joints)
         chain = chain_from_model(model, spec.tip)
     except RecipeError as error:
@@ -45,13 +43,6 @@ def load_robot(problem: Problem) -> Robot:
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
     return robot
-
-
-def _urdf_text(problem: Problem) -> str:
-    try:
-        return problem.urdf_text
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecipeError([f"{problem.urdf_path}: not a URDF that Pinocchio can read: {error}"]) from error
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:

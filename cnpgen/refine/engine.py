@@ -13,6 +13,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernel
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import ProblemRecord, open_problem
+from cnpgen.refine.deadline import refine_until
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import DEFAULT, RefineOptions
 from cnpgen.refine.polish import refine_task
@@ -40,6 +41,8 @@ def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
     """
     refiner = prepare(plans, options)
     jury = _jury(plans.problem, plans.degree, options.step, get_ident())
+    if options.deadline is not None:
+        return [refine_until(refiner, jury, task, options.deadline) for task in tasks_of(plans)]
     return [refine_task(refiner, jury, task) for task in tasks_of(plans)]
 
 
@@ -50,7 +53,7 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
         path_control_points=plans.path_control_points.shape[1],
         rate_control_points=plans.rate_control_points.shape[1],
     )
-    return _refiner(plans.problem, spec, options)
+    return _refiner(plans.problem, spec, replace(options, deadline=None))
 
 
 def tasks_of(plans: Plans) -> list[Task]:

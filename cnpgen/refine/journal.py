@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,10 +17,14 @@ from numpy.typing import NDArray
 from cnpgen.errors import MachineError, UsageError, counted
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.store.files.atomic import machine_error
-from cnpgen.store.files.documents import differences
+from cnpgen.store.files.documents import differences, parse_json
 
 MAGIC = b"cnpgen journal 1\n"
 _DIGEST = hashlib.sha256().digest_size
+# What NumPy and Python say of a frame whose digest is right and that cnpgen has not written.
+_NOT_OURS = (
+    ValueError, KeyError, TypeError, IndexError, EOFError, RuntimeError, MemoryError, OverflowError, zipfile.BadZipFile,
+)  # fmt: skip
 _MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # nothing is emptied before it is locked
 
 
@@ -94,7 +99,10 @@ def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Jour
     frames, end = _read_frames(file) if head == MAGIC else ([], 0)
     journal = Journal(path, {}, file)
     for frame in frames[1:]:
-        journal.finished |= _unpack(frame)
+        try:
+            journal.finished |= _unpack(frame)
+        except _NOT_OURS as error:
+            raise UsageError(f"{path} is no journal that cnpgen has written: {error}") from error
     if frames and frames[0] == identity.encode():
         file.truncate(end)
         return journal
@@ -114,7 +122,7 @@ def _begin(path: Path, file: IO[bytes], identity: str, *, discard: bool) -> Jour
 def _changed(found: bytes, mine: str) -> list[str]:
     """Say in what two runs differ, with the values where they are short: those of plans are digests."""
     try:
-        changed = differences(json.loads(found), json.loads(mine))
+        changed = differences(parse_json(found.decode()), json.loads(mine))
     except ValueError:
         return ["another version"]
     return [f"{each.key} {each.found}, now {each.wanted}" if each.is_short else f"other {each.key}" for each in changed]
@@ -162,7 +170,9 @@ def _pack(plans: Sequence[int], refined: Sequence[Refined]) -> bytes:
 
 def _unpack(frame: bytes) -> dict[int, Refined]:
     with np.load(io.BytesIO(frame), allow_pickle=False) as arrays:
-        numbers, reasons = json.loads(arrays["words"].tobytes())
+        if any(member.compress_type != zipfile.ZIP_STORED for member in arrays.zip.infolist()):
+            raise ValueError("its arrays are packed")  # ours are not: a few bytes could become gigabytes
+        numbers, reasons = parse_json(arrays["words"].tobytes().decode())
         path, rate, cost = (arrays[name] for name in ("path", "rate", "cost"))
     return {
         plan: Refined(path[i], rate[i], Outcome(outcome), reasons[i], iterations, float(cost[i]))

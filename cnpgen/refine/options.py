@@ -1,6 +1,7 @@
 """What users choose about refining."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.judges.plans.judge import check_step
@@ -23,6 +24,8 @@ class RefineOptions:
         tolerance: Relative change of the objective below which it has settled: what follows only makes it feasible.
             From nothing a tenth of it counts, among obstacles a twentieth.
         step: The verdict looks at moments no further apart than this [s], 1 ms at most.
+        deadline: How long refining a plan may take [s]; None for as long as it takes. What comes of it then depends on
+            the machine and on what else it does.
 
     Raises:
         UsageError: A value makes no sense.
@@ -33,6 +36,7 @@ class RefineOptions:
     max_iterations: int = sqp.DEFAULT.max_iterations
     tolerance: float = sqp.DEFAULT.cost_tolerance
     step: float = 1e-3
+    deadline: float | None = None
 
     def __post_init__(self) -> None:
         if self.objective not in OBJECTIVES:
@@ -44,6 +48,12 @@ class RefineOptions:
         check_step(number("step", self.step), COARSEST)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
+        if self.deadline is not None and number("deadline", self.deadline) <= 0:
+            raise UsageError(f"the deadline must be above 0 s, got {self.deadline}")
+
+    def said(self) -> dict[str, Any]:
+        """Return the options for JSON; no deadline is not mentioned."""
+        return {name: value for name, value in asdict(self).items() if name != "deadline" or value is not None}
 
 
 DEFAULT = RefineOptions()

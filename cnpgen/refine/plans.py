@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -234,7 +234,7 @@ def _assembled(given: Plans, refined: list[Refined], options: RefineOptions) -> 
         path_control_points=np.stack([each.path for each in refined]),
         rate_control_points=np.stack([each.rate for each in refined]),
         columns={**given.columns, **_columns(refined)},
-        refined_with=json.dumps({"cnpgen": __version__, **asdict(options)}),
+        refined_with=json.dumps({"cnpgen": __version__, **options.said()}),
     )
     valid, screened = np.array([each.valid for each in refined]), screen(plans)
     status = np.where(valid, PlanStatus.VALID, np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened))
@@ -261,7 +261,7 @@ def _identity(plans: Plans, options: RefineOptions) -> str:
     for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
         digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
     return json.dumps(
-        {"version": __version__, "options": asdict(options), "degree": plans.degree, "plans": digest.hexdigest()}
+        {"version": __version__, "options": options.said(), "degree": plans.degree, "plans": digest.hexdigest()}
     )
 
 

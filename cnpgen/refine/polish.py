@@ -21,7 +21,7 @@ HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless t
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class Candidate:
     """A plan with its verdict.
 
     Attributes:
@@ -41,7 +41,7 @@ class _Candidate:
 
 
 @dataclass
-class _Search:
+class Search:
     """What was tried for one task.
 
     Attributes:
@@ -57,7 +57,7 @@ class _Search:
     jury: Jury
     task: Task
     iterations: int = 0
-    judged: list[_Candidate] = field(default_factory=list)
+    judged: list[Candidate] = field(default_factory=list)
     hopeless: list[Attempt] = field(default_factory=list)
 
     def offer(self, attempt: Attempt) -> bool:
@@ -70,7 +70,7 @@ class _Search:
         self.judged.append(self._candidate(attempt))
         return enough or (self.judged[-1].refined.valid and self.judged[-1].precise)
 
-    def best(self) -> _Candidate:
+    def best(self) -> Candidate:
         """Return the best attempt."""
         if not self.judged:
             self.judged.append(self._candidate(min(self.hopeless, key=lambda each: (each.excess, each.cost))))
@@ -80,19 +80,19 @@ class _Search:
         """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted."""
         return not best.valid or (cost <= best.cost and not self.jury.refutes(self.task, path, rate))
 
-    def weigh(self, path: Array, rate: Array, cost: float, outcome: Outcome) -> _Candidate:
+    def weigh(self, path: Array, rate: Array, cost: float, outcome: Outcome) -> Candidate:
         """Judge a plan whose objective is ``cost``."""
         verdict = self.jury.verdict(self.task, path, rate)
         reached = outcome if verdict.valid or outcome in GIVEN else Outcome.UNSOLVED
         refined = Refined(path, rate, reached, verdict.reason, 0, cost)
-        return _Candidate(refined, _severity(verdict), self._is_precise(verdict))
+        return Candidate(refined, _severity(verdict), self._is_precise(verdict))
 
     def _is_precise(self, verdict: Verdict) -> bool:
         check = self.refiner.check
         worst = max((each.severity for each in verdict.margins.values() if each.name in check.equalities), default=0.0)
         return worst <= PRECISE or worst <= PRECISE + check.imprecision_of_ends(self.task)
 
-    def _candidate(self, attempt: Attempt) -> _Candidate:
+    def _candidate(self, attempt: Attempt) -> Candidate:
         path, rate = self.refiner.check.transcription(self.task).unpack(attempt.x)
         if attempt.outcome is Outcome.ADJUSTED and _is_given(self.task, path, rate):
             return self.weigh(path, rate, attempt.cost, Outcome.KEPT)
@@ -109,13 +109,13 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
         task: The boundary problem.
     """
     if not task.is_finite:
-        return _unusable(refiner, task)
-    search, given = _Search(refiner, jury, task), refiner.given(task)
+        return unusable(refiner, task)
+    search, given = Search(refiner, jury, task), refiner.given(task)
     for attempt in refiner.attempts(task, given):
         if search.offer(attempt):
             break
     best = search.best()
-    for path, rate, outcome in _as_given(refiner, task, given):
+    for path, rate, outcome in as_given(refiner, task, given):
         cost = refiner.check.transcription(task).objective(path, rate)
         if search.may_be_better(path, rate, cost, best.refined):
             kept = search.weigh(path, rate, cost, outcome)
@@ -125,7 +125,7 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
     return Refined(**{**vars(best.refined), "iterations": search.iterations})
 
 
-def _as_given(refiner: Refiner, task: Task, given: Array | None) -> Iterator[tuple[Array, Array, Outcome]]:
+def as_given(refiner: Refiner, task: Task, given: Array | None) -> Iterator[tuple[Array, Array, Outcome]]:
     """Yield the plan as it was given, where it can be evaluated: with exact ends if it had others, and as it is."""
     if given is not None:
         path, rate = refiner.check.transcription(task).unpack(given)
@@ -151,7 +151,7 @@ def _severity(verdict: Verdict) -> float:
     return max((margin.severity for margin in verdict.margins.values()), default=np.inf)
 
 
-def _unusable(refiner: Refiner, task: Task) -> Refined:
+def unusable(refiner: Refiner, task: Task) -> Refined:
     """Return the given plan, or nothing but nan, for boundary conditions that are no numbers."""
     spec, n = refiner.spec, task.boundary.start_q.shape[1]
     path = np.full((spec.path_control_points, n), np.nan) if task.path is None else task.path

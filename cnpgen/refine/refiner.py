@@ -195,7 +195,7 @@ class Refiner:
         bounds = self.bounds(task, which, ends)
         if not np.nanmax(bounds.beyond(ends)) < LOST:
             settings = replace(settings, max_iterations=0)
-        return minimise(motion, bounds, x, settings)
+        return minimise(motion, bounds, x, settings, until=task.until)
 
     def transcription(self, task: Task, which: Pass) -> Transcription:
         """Return the motion on the grid of a pass."""

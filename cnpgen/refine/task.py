@@ -1,5 +1,6 @@
 """One boundary problem for the refiner, and what comes of it."""
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -24,6 +25,7 @@ class Outcome(IntEnum):
     UNUSABLE = 6
     ADJUSTED = 7
     UNSETTLED = 8
+    OUT_OF_TIME = 9
 
     @property
     def text(self) -> str:
@@ -37,6 +39,7 @@ class Outcome(IntEnum):
             Outcome.UNSOLVED: "no valid plan was found; this is the best one",
             Outcome.ADJUSTED: "kept as it was given but for its ends, made exact, and its rates, made positive",
             Outcome.UNSETTLED: "valid, but the objective still fell when its steps were used up",
+            Outcome.OUT_OF_TIME: "the best until the deadline: with more time there may be a better one",
             Outcome.UNUSABLE: "the boundary conditions are no numbers",
         }[self]
 
@@ -52,6 +55,7 @@ class Task:
         goal_xyz: Position of the tip at the goal [m], shape (3,).
         path: Path control points of the given plan [rad], shape (C, n), or None.
         rate: Its rate control points [1/s], shape (R,), or None.
+        until: When steps should be over, as ``time.perf_counter`` counts [s].
     """
 
     boundary: Boundary
@@ -60,6 +64,7 @@ class Task:
     goal_xyz: Array
     path: Array | None = None
     rate: Array | None = None
+    until: float = math.inf
 
     @property
     def at_rest(self) -> bool:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+LINK = " (link)"  # behind the name of a link that a joint has, too
 _PLANNED = "only revolute and prismatic joints can be planned"
 _KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
     "JointModelRUB": "a continuous joint, which has no limits (make it revolute, with limits)",
@@ -86,13 +87,28 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     if not model.existFrame(tip):
         known = [frame.name for frame in model.frames]
         raise RecipeError([f"robot.tip: {model.name} has no frame {tip!r}{nearest(tip, known)}"])
-    frame = model.frames[model.getFrameId(tip)]
+    frame = model.frames[frame_of(model, tip)]
     if frame.parentJoint != model.njoints - 1:
         raise RecipeError([f"robot.tip: frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
     joints = tuple(_joint(model, data, index) for index in range(1, model.njoints))
     return Chain(
         joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear)
     )
+
+
+def tell_links_apart(model: "pin.Model") -> None:
+    """Rename the frames of links that have the name of a joint: Pinocchio looks for frames by name."""
+    import pinocchio as pin
+
+    joints = {frame.name for frame in model.frames if frame.type != pin.FrameType.BODY}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY and frame.name in joints:
+            frame.name += LINK
+
+
+def frame_of(model: "pin.Model", name: str) -> int:
+    """Return the number of a frame; where a link and a joint have the same name, that of the link."""
+    return int(model.getFrameId(name + LINK if model.existFrame(name + LINK) else name))
 
 
 def _kind(name: str) -> str:

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
-from cnpgen.robots.chain import Chain
+from cnpgen.robots.chain import Chain, frame_of, tell_links_apart
+from cnpgen.robots.mimic import check_mimic
+from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -76,6 +78,11 @@ class Robot:
         """The Pinocchio model reduced to the planned joints."""
         return reduced_model(self.urdf, self.urdf_text, self.joint_names)
 
+    @cached_property
+    def tip_frame(self) -> int:
+        """Number of the tip's frame in the model."""
+        return frame_of(self.model, self.tip)
+
 
 def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model":
     """Build the Pinocchio model of a URDF, reduced to the planned joints.
@@ -91,8 +98,10 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...]) -> "pin.Model"
     import pinocchio as pin
 
     try:
+        check_mimic(urdf_tree(text), joints)
         model = pin.buildModelFromXML(text)
-    except (ValueError, RuntimeError) as error:
+        tell_links_apart(model)
+    except (ValueError, RuntimeError, IndexError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
     known = list(model.names)[1:]
     missing = [f"{urdf.name} has no joint {name!r}{nearest(name, known)}" for name in joints if name not in known]
@@ -115,7 +124,7 @@ def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         q = random.uniform(model.lowerPositionLimit, model.upperPositionLimit)
         pin.framesForwardKinematics(model, data, q)
         origins = [data.oMi[i].translation for i in range(1, model.njoints)]
-        poses.append(np.array([*origins, data.oMf[model.getFrameId(tip)].translation]))
+        poses.append(np.array([*origins, data.oMf[frame_of(model, tip)].translation]))
     points = np.array(poses)  # (configurations, points, 3)
 
     def still(a: int) -> bool:

@@ -14,10 +14,13 @@ from cnpgen.schema.units import show
 
 Recipe = TypeVar("Recipe")
 
+LONGEST = 200  # characters of a name that a message repeats
+
 _LAYOUT: dict[Kind, str] = {  # where the shipped files of a kind are
     "problem": "problems/*/problem.toml",
     "pipeline": "pipelines/*.toml",
     "dataset": "datasets/*.toml",
+    "suite": "datasets/suites/*.toml",
 }
 
 
@@ -39,18 +42,19 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
     """Find a recipe of one of several kinds, the first one first; a ValueError says why there is none."""
     text = os.fspath(name_or_path)
     path = (folder or Path()) / text
+    shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
     known = {name: file for kind in reversed(kinds) for name, file in list_recipes(kind).items()}
     is_path = isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text or os.sep in text
-    if path.is_file():
+    if os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         return path
     if is_path:
-        hint = nearest(Path(text).stem, known)
-        raise ValueError(
-            f"{path} is a folder, expected a .toml file" if path.is_dir() else f"no such file: {path}{hint}"
-        )
+        hint = nearest(Path(shown).stem, known)
+        if os.path.isdir(path):  # noqa: PTH112 - likewise
+            raise ValueError(f"{path} is a folder, expected a .toml file")
+        raise ValueError(f"no such file: {(folder or Path()) / shown}{hint}")
     if text not in known:
-        hint = _hint(text, kinds, known)
-        raise ValueError(f"unknown {_either(kinds)} {text!r}{hint}; known: {', '.join(known) or 'none'}")
+        hint = _hint(shown, kinds, known)
+        raise ValueError(f"unknown {_either(kinds)} {shown!r}{hint}; known: {', '.join(known) or 'none'}")
     return known[text]
 
 

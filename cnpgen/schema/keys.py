@@ -115,7 +115,7 @@ class Place:
     def __truediv__(self, key: str | int) -> "Place":
         if isinstance(key, int):
             return Place(self.file, f"{self.key} {key + 1}")
-        bare = key if re.fullmatch(r"[\w-]+", key) else json.dumps(key)
+        bare = key if re.fullmatch(r"[\w-]{1,60}", key) else json.dumps(key[:60])
         return Place(self.file, f"{self.key}.{bare}" if self.key else bare)
 
     def says(self, text: str) -> str:
@@ -164,4 +164,4 @@ def _expected(hint: Any, unit: str) -> str:
     return {int: "an integer", bool: "true or false", str: "a string"}.get(hint, "a table")
 
 
-NAME = "^[a-z0-9][a-z0-9-]*$"
+NAME = "^[a-z0-9][a-z0-9-]{0,99}$"

@@ -13,6 +13,8 @@ from cnpgen.schema.units import parse_number, parse_numbers, parse_range, show
 
 T = TypeVar("T")
 
+MOST_UNKNOWN = 20  # unknown keys of a table that are named; the others are counted
+
 Reader = Callable[[Any, Place, list[str]], Any]
 """A function of (TOML value, where it is, mistakes) that returns an object, or None after adding to the mistakes."""
 
@@ -66,9 +68,12 @@ class _Parser:
             raise ValueError(f"expected a table, got {show(table)}")  # noqa: TRY004 - a user's mistake
         before = len(self.mistakes)
         known = {key.name: key for key in keys(cls)}
-        for name in [name for name in table if name not in known]:
+        unknown = [name for name in table if name not in known]
+        for name in unknown[:MOST_UNKNOWN]:
             hint = nearest(name, known) or f", known: {', '.join(known)}"
             self.mistakes.append((where / name).says(f"unknown key{hint}"))
+        if len(unknown) > MOST_UNKNOWN:
+            self.mistakes.append(where.says(f"and {len(unknown) - MOST_UNKNOWN:,} more unknown keys"))
         for name, key in known.items():
             if key.required and name not in table:
                 self.mistakes.append((where / name).says(f"missing key, expected {key.expected}: {key.doc}"))

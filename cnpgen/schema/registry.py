@@ -1,4 +1,4 @@
-"""The registry of stages and constraints: built-in kinds by name, others from entry points of installed packages."""
+"""The registry of stages, constraints and planners: built-in kinds by name, others from installed packages."""
 
 import contextlib
 import dataclasses
@@ -16,19 +16,23 @@ from cnpgen.errors import RecipeError, nearest
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
+PLANNERS = "cnpgen.planners"
 
 CONTRACTS: dict[str, str] = {  # what a kind is a subclass of
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
     CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
+    PLANNERS: "cnpgen.benchmark.planner:BenchmarkPlanner",
 }
 
 BUILT_IN: dict[str, dict[str, str]] = {
     STAGES: {
         "draw-positions": "cnpgen.pipelines.stages.draw:DrawPositions",
+        "given-positions": "cnpgen.pipelines.stages.given_positions:GivenPositions",
         "start-ik": "cnpgen.pipelines.stages.ik:StartIK",
         "goal-ik": "cnpgen.pipelines.stages.ik:GoalIK",
         "hit-angle-to-goal": "cnpgen.pipelines.stages.hit_angle:HitAngleToGoal",
         "hit-angle-in-cone": "cnpgen.pipelines.stages.hit_angle:HitAngleInCone",
+        "behind-puck": "cnpgen.pipelines.stages.behind_puck:BehindPuck",
         "hitting-configuration": "cnpgen.pipelines.stages.hitting_configuration:HittingConfiguration",
         "hitting-velocity": "cnpgen.pipelines.stages.hitting_velocity:HittingVelocity",
         "at-rest": "cnpgen.pipelines.stages.motion:AtRest",
@@ -46,9 +50,23 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "joint-acceleration": "cnpgen.problems.constraints.joint:JointAcceleration",
         "joint-torque": "cnpgen.problems.constraints.joint:JointTorque",
         "table": "cnpgen.problems.constraints.table:Table",
+        "plane": "cnpgen.problems.constraints.plane:Plane",
+        "line": "cnpgen.problems.constraints.line:Line",
         "vertical": "cnpgen.problems.constraints.vertical:Vertical",
+        "axis": "cnpgen.problems.constraints.axis:Axis",
+        "pose": "cnpgen.problems.constraints.pose:Pose",
+        "tip-speed": "cnpgen.problems.constraints.tip_speed:TipSpeed",
         "robot-clearance": "cnpgen.problems.constraints.clearance:RobotClearance",
         "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
+    },
+    PLANNERS: {
+        "cnp-b": "cnpgen.benchmark.planners.learned:CNPB",
+        "cnp-b+refine": "cnpgen.benchmark.planners.learned:RefinedCNPB",
+        "solve": "cnpgen.benchmark.planners.solve:Solve",
+        "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
+        "aqp": "cnpgen.benchmark.planners.aqp:AQP",
+        "cbirrt": "cnpgen.benchmark.planners.cbirrt:CBiRRT",
+        "sst": "cnpgen.benchmark.planners.sst:SST",
     },
 }
 
@@ -57,7 +75,7 @@ def names(group: str) -> tuple[str, ...]:
     """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
 
     Args:
-        group: ``STAGES`` or ``CONSTRAINTS``.
+        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
     """
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
@@ -67,11 +85,11 @@ def load(group: str, name: str) -> type[Any]:
     """Import the class of a kind.
 
     Args:
-        group: ``STAGES`` or ``CONSTRAINTS``.
+        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
         name: Name of the kind, as ``use`` has it in a recipe.
 
     Returns:
-        A concrete subclass of ``Stage`` or ``Constraint``.
+        A concrete subclass of ``Stage``, ``Constraint`` or ``BenchmarkPlanner``.
 
     Raises:
         RecipeError: The kind is unknown, defined twice, or cannot be imported.
@@ -95,8 +113,8 @@ def contract(group: str) -> type[Any]:
 
 
 def noun_of(group: str) -> str:
-    """Say what a kind of a group is: "stage" or "constraint"."""
-    return CONTRACTS[group].partition(":")[2].lower()
+    """Say what a kind of a group is: "stage", "constraint" or "planner"."""
+    return group.removeprefix("cnpgen.").removesuffix("s")
 
 
 def group_of(kind: type) -> str:
@@ -109,7 +127,7 @@ def name_of(group: str, kind: type) -> str:
     """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
 
     Args:
-        group: ``STAGES`` or ``CONSTRAINTS``.
+        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
         kind: The class.
     """
     spec = f"{kind.__module__}:{kind.__qualname__}"
@@ -156,7 +174,7 @@ def why_missing(group: str, use: str, package: str) -> str:
     """Say which package to install for a kind that a recipe of somebody else names; empty if the kind is there.
 
     Args:
-        group: ``STAGES`` or ``CONSTRAINTS``.
+        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
         use: Name of the kind.
         package: The package that had it, empty if that is not known.
     """

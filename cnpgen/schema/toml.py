@@ -5,20 +5,29 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-Kind = Literal["problem", "pipeline", "dataset"]
+Kind = Literal["problem", "pipeline", "dataset", "suite"]
 
 MARKS: dict[Kind, set[str]] = {
     "problem": {"robot", "constraint", "limits"},
     "pipeline": {"stage", "problem"},
     "dataset": {"splits", "pipeline"},
+    "suite": {"pucks", "turns", "draws"},
 }
 """Top-level keys that only files of a kind have."""
+
+
+# What strangers' files may be, looked at before they are parsed: tomllib takes the square of a key's parts as its time.
+MOST_BYTES = 1 << 18
+MOST_PARTS = 16  # of a key: a.b.c has three
+_LONG_KEY = re.compile(
+    rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}""", re.ASCII
+)
 
 
 def kind_of_file(path: Path) -> Kind:
     """Tell the kind of a recipe file by its keys; "dataset" where they do not tell or it cannot be read."""
     try:
-        table = _toml(path.read_bytes())
+        table = _toml(_read(path))
     except (OSError, ValueError):
         return "dataset"
     return next((kind for kind in MARKS if is_kind(kind, table)), "dataset")
@@ -27,12 +36,21 @@ def kind_of_file(path: Path) -> Kind:
 def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict[str, Any] | None:
     """Return the top-level table of a recipe file, or None after a mistake."""
     try:
-        return _expect(kinds, _toml(path.read_bytes()))
+        return _expect(kinds, _toml(_read(path)))
     except OSError as error:
         mistakes.append(f"{path}: cannot be read: {error.strerror}")
     except ValueError as error:
         mistakes.append(f"{path}: {error}")
     return None
+
+
+def _read(path: Path) -> bytes:
+    """Read a recipe file; a ValueError says that it is none."""
+    if not path.is_file():
+        raise ValueError("not a file" if path.exists() else "no such file")
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise ValueError(f"has {size:,} bytes, expected a recipe of at most {MOST_BYTES:,}")
+    return path.read_bytes()
 
 
 def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
@@ -46,10 +64,15 @@ def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
 def _toml(data: bytes) -> dict[str, Any]:
     """Parse TOML; a ValueError says in which line it is wrong."""
     try:
-        return tomllib.loads(data.decode("utf-8-sig"))
+        content = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise ValueError(f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}") from error
+    if key := _LONG_KEY.search(content):
+        line = content.count("\n", 0, key.start()) + 1
+        raise ValueError(f"line {line}: a key has more than {MOST_PARTS} parts")
+    try:
+        return tomllib.loads(content)
     except (ValueError, RecursionError) as error:
         found = re.search(r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error))
         line = int(found[1]) if found and found[1] else len(data.splitlines())

@@ -12,11 +12,30 @@ from typing import Any
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import canonical_sha256, load_document, plain, save_document
+from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Maybe, check_form
+from cnpgen.store.files.limits import MOST_COLUMNS, MOST_FIELDS, MOST_SHARDS
 from cnpgen.store.layout import PLAN, SPLIT_NAME, WORK, shard_stem
 
 FORMAT = "cnpgen-plan"
 REVISION = 2  # of the generator: raised by every change after which the same blueprint would give other rows
 FORMAT_VERSION = 2  # what was never extended is written as version 1, and has no "earlier"
+_FIELD = {
+    **dict.fromkeys(("name", "unit", "long_name", "role", "frame", "dtype"), TEXT),
+    "width": WHOLE,
+    "names": [TEXT],
+    "valid_min": Maybe([NUMBER]),
+    "valid_max": Maybe([NUMBER]),
+}
+FORM = {
+    **dict.fromkeys(("name", "version", "title", "license", "recipe_sha256", "dtype", "backend", "generator"), TEXT),
+    **dict.fromkeys(("fingerprint", "seed"), TEXT),
+    **dict.fromkeys(("shard_size", "block_rows", "revision"), WHOLE),
+    "recipe": {EVERY: ANYTHING},
+    "splits": {EVERY: WHOLE},
+    "fields": [_FIELD],
+    "robot": {EVERY: ANYTHING},
+    "versions": {EVERY: TEXT},
+}
 INFORMATIONAL = ("title", "license", "versions", "recipe")  # what may differ in equal blueprints; recipe_sha256 may not
 
 
@@ -169,6 +188,12 @@ def _check_sizes(blueprint: Blueprint) -> None:
         raise UsageError(f"the seed must not be negative, got {blueprint.seed}")
     if blueprint.dtype not in {"float64", "float32"}:
         raise UsageError(f"dtype must be 'float64' or 'float32', got {blueprint.dtype!r}")
+    count = sum(-(-rows // blueprint.shard_size) for rows in blueprint.splits.values())
+    if count > MOST_SHARDS:
+        raise UsageError(
+            f"{count:,} shards of {blueprint.shard_size:,} rows are too many, expected at most {MOST_SHARDS:,}:"
+            " choose a larger shard_size"
+        )
     if any(rows < 0 for rows in blueprint.splits.values()) or not any(blueprint.splits.values()):
         found = ", ".join(f"{name} {rows}" for name, rows in blueprint.splits.items())
         raise UsageError(f"the splits must have rows, got {found or 'none'}")
@@ -182,8 +207,13 @@ def _check_names(blueprint: Blueprint) -> None:
         if not SPLIT_NAME.fullmatch(split):
             raise UsageError(f"a split is named with letters, digits and '_', starting with a letter; got {split!r}")
     names = [item.name for item in blueprint.fields]
-    if not names or len(set(names)) != len(names):
-        raise UsageError(f"the fields must have different names, got {names}")
+    if not names or len(set(names)) != len(names) or len(names) > MOST_FIELDS:
+        raise UsageError(f"the fields must have different names, from 1 to {MOST_FIELDS:,}, got {names!s:.200}")
+    for item in blueprint.fields:
+        widths = {len(part) for part in (item.valid_min, item.valid_max) if part is not None}
+        wrong = widths - {max(item.width, 1)} or (item.names and len(item.names) != item.width)
+        if wrong or item.width > MOST_COLUMNS or item.dtype not in {"float", "int64"}:
+            raise UsageError(f"the field {item.name!r} must have as many names and limits as columns: {item!r:.200}")
 
 
 def default_shard_size(rows: int, block_rows: int = 4096) -> int:
@@ -252,6 +282,7 @@ def from_json(content: Mapping[str, Any]) -> Blueprint:
     """
     try:
         arguments = {name: content[name] for name in Blueprint.__dataclass_fields__ if name != "earlier"}
+        check_form(content.get("earlier", []), [{EVERY: WHOLE}])
         arguments["earlier"] = tuple(content.get("earlier", ()))
         arguments["seed"] = int(content["seed"])
         arguments["fields"] = tuple(_field(item) for item in content["fields"])
@@ -287,7 +318,7 @@ def load_blueprint(folder: Path) -> Blueprint:
         MachineError: The system would not let us read it.
     """
     path = folder / PLAN
-    document = load_document(path, FORMAT, version=FORMAT_VERSION)
+    document = load_document(path, FORMAT, version=FORMAT_VERSION, form=FORM)
     blueprint = from_json(document)
     if blueprint.fingerprint != document.get("fingerprint"):
         raise DatasetError(f"{path} is damaged: its fingerprint does not match its content")

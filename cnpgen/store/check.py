@@ -11,9 +11,9 @@ from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shard_attributes, shards
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.intact import AGAIN
+from cnpgen.store.intact import AGAIN, OUTSIDE, leads_outside
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
-from cnpgen.store.manifest import data_fingerprint, load_manifest
+from cnpgen.store.manifest import data_fingerprint, lists_shards_of, load_manifest
 from cnpgen.store.record import load_record
 from cnpgen.store.shard import (
     FORMAT,
@@ -35,6 +35,7 @@ REPLACE = (
     " 'cnpgen make-dataset --force'"
 )
 DELETE = f"delete such a shard and the .json beside it, then {AGAIN}"
+COPY = "copy the dataset so that links become files: cp -rL"
 REMOVE = "move elsewhere what is not part of the dataset"
 
 
@@ -121,10 +122,9 @@ def _check_manifest(folder: Path, blueprint: Blueprint) -> tuple[list[Finding], 
         return [Finding(MANIFEST, _reason(error, folder / MANIFEST), advice=MAKE_AGAIN)], {}
     if manifest["plan_fingerprint"] != blueprint.fingerprint:
         return [Finding(MANIFEST, "is of another blueprint than plan.json", advice=MAKE_AGAIN)], {}
-    entries = _shard_entries(manifest)
-    findings = []
-    if entries.keys() != {task.file for task in shards(blueprint)}:
-        findings.append(Finding(MANIFEST, "lists other shards than plan.json", advice=MAKE_AGAIN))
+    if not lists_shards_of(manifest, blueprint):
+        return [Finding(MANIFEST, "lists other shards than plan.json", advice=MAKE_AGAIN)], {}
+    entries, findings = _shard_entries(manifest), []
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
         findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", advice=MAKE_AGAIN))
     for name in _LISTED:
@@ -166,6 +166,8 @@ def check_shard(
     findings, expected = _check_sidecar(folder, blueprint, task, entry)
     if not path.is_file():
         return [*findings, Finding(task.file, "is missing", advice=MAKE_AGAIN)]
+    if outside := [name for name in (task.file, task.sidecar) if leads_outside(folder / name)]:
+        return [*findings, *(Finding(name, OUTSIDE, advice=COPY) for name in outside)]
     if expected is None:  # nobody knows what the file should be, and findings says why
         return findings
     damage = _check_file(folder, task.file, *expected)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
+from cnpgen.store.files.forms import EVERY, NUMBER, TEXT, WHOLE
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,17 @@ def densities_to_json(densities: Mapping[str, DensityMap]) -> dict[str, Any]:
     }
 
 
+DENSITIES_FORM = {EVERY: {"x": [NUMBER], "y": [NUMBER], "drawn": [[WHOLE]], "accepted": [[WHOLE]]}}
+FATES_FORM = {
+    "tried": WHOLE,
+    "accepted": WHOLE,
+    "rejections": {EVERY: WHOLE},
+    "stages": {EVERY: TEXT},
+    "verification": {EVERY: NUMBER},
+    "densities": DENSITIES_FORM,
+}
+
+
 def densities_from_json(content: Mapping[str, Any]) -> dict[str, DensityMap]:
     """Rebuild density maps from their JSON form."""
     return {name: _density(item) for name, item in content.items()}
@@ -122,12 +134,14 @@ def densities_from_json(content: Mapping[str, Any]) -> dict[str, DensityMap]:
 
 def _density(content: Mapping[str, Any]) -> DensityMap:
     (x_low, x_high), (y_low, y_high) = content["x"], content["y"]
-    counts = [np.array(content[key], np.int64) for key in ("drawn", "accepted")]
-    return DensityMap((float(x_low), float(x_high)), (float(y_low), float(y_high)), *counts)
+    drawn, accepted = (np.array(content[key], np.int64) for key in ("drawn", "accepted"))
+    if drawn.ndim != 2 or drawn.shape != accepted.shape:
+        raise ValueError(f"a density map must have two grids of the same shape, got {drawn.shape}, {accepted.shape}")
+    return DensityMap((float(x_low), float(x_high)), (float(y_low), float(y_high)), drawn, accepted)
 
 
 def fates_from_json(content: Mapping[str, Any]) -> Fates:
-    """Rebuild fates from its JSON form."""
+    """Rebuild fates from what has the form ``FATES_FORM``."""
     return Fates(
         tried=int(content["tried"]),
         accepted=int(content["accepted"]),

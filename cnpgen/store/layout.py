@@ -24,7 +24,7 @@ WORK = "_work"
 DOCUMENTS = (PLAN, MANIFEST, STATS, CARD, CROISSANT)
 """The files of a dataset that are not of one shard."""
 
-SPLIT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+SPLIT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 """Names that are folders everywhere and splits to Hugging Face."""
 
 

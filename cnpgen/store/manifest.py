@@ -10,18 +10,30 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import Blueprint
+from cnpgen.store.blueprint import Blueprint, shards
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256, write_file
 from cnpgen.store.files.documents import load_document, plain, render, save_document
+from cnpgen.store.files.forms import EVERY, TEXT, WHOLE
 from cnpgen.store.files.leftovers import sweep_all
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
 from cnpgen.store.summary import Summary, stats_document, summarise
 
 FORMAT = "cnpgen-dataset"
 FORMAT_VERSION = 1
+_SHARD = {
+    **dict.fromkeys(("file", "sha256"), TEXT),
+    **dict.fromkeys(("rows", "first_sample_id", "bytes"), WHOLE),
+    "sidecar": {"file": TEXT, "sha256": TEXT},
+}
+FORM = {
+    "fingerprint": TEXT,
+    "plan_fingerprint": TEXT,
+    "splits": {EVERY: {"rows": WHOLE, "shards": [_SHARD]}},
+    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in (PLAN, STATS, CARD, CROISSANT)},
+}
 
 
 def finalize(folder: Path, blueprint: Blueprint, *, notes: str = "") -> dict[str, Any]:
@@ -74,7 +86,23 @@ def load_manifest(folder: Path) -> dict[str, Any]:
         DatasetError: It is missing (the dataset is unfinished), damaged or written by a newer cnpgen.
         MachineError: The system would not let us read it.
     """
-    return load_document(folder / MANIFEST, FORMAT, version=FORMAT_VERSION)
+    return load_document(folder / MANIFEST, FORMAT, version=FORMAT_VERSION, form=FORM)
+
+
+def lists_shards_of(manifest: dict[str, Any], blueprint: Blueprint) -> bool:
+    """Whether a manifest lists the shards of a blueprint, in order, under their names, and nothing else.
+
+    Only names that the blueprint gives are opened: no path in a manifest leads out of the dataset's folder.
+    """
+    found = {split: [_place(entry) for entry in content["shards"]] for split, content in manifest["splits"].items()}
+    wanted: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in blueprint.splits}
+    for task in shards(blueprint):
+        wanted[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
+    return found == wanted
+
+
+def _place(entry: dict[str, Any]) -> tuple[str, str, int, int]:
+    return entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"]
 
 
 def source_date() -> datetime | None:
@@ -128,13 +156,13 @@ def _manifest(folder: Path, summary: Summary, *, created: str) -> dict[str, Any]
     }
 
 
-def data_fingerprint(shards: Iterable[tuple[str, str]]) -> str:
+def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
     """Compute the fingerprint of a dataset's rows, as ``sha256sum */shard-*.h5 | sha256sum`` in its folder does.
 
     Args:
-        shards: Path and sha256 of every shard.
+        files: Path and sha256 of every shard.
     """
-    lines = "".join(f"{sha256}  {file}\n" for file, sha256 in sorted(shards))
+    lines = "".join(f"{sha256}  {file}\n" for file, sha256 in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 

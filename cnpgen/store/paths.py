@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.files.kind import HDF5, own_kind
+from cnpgen.store.files.kind import HDF5, PLANS, own_kind
 from cnpgen.store.workspace import is_dataset
 
-PLANS = "a file of plans"
 _SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 
 
@@ -53,11 +52,11 @@ def file_kind(path: Path) -> str:
 
 
 def _hdf5_kind(path: Path) -> str:
-    from cnpgen.store.files.hdf5 import opened_foreign_hdf5
+    from cnpgen.store.files.hdf5 import opened_hdf5
 
     try:
-        with opened_foreign_hdf5(path) as file:
-            said, names = file.attrs.get("format"), set(file)
+        with opened_hdf5(path) as file:
+            said, names = file.attributes.some(["format"]).get("format"), set(file)
     except (DatasetError, MachineError):
         return "an HDF5 file"
     said = said.decode(errors="replace") if isinstance(said, bytes) else said

@@ -13,7 +13,7 @@ from cnpgen.errors import DatasetError, lacks
 from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, PLAN
-from cnpgen.store.manifest import load_manifest
+from cnpgen.store.manifest import lists_shards_of, load_manifest
 from cnpgen.store.paths import require_folder
 from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard, storage_dtype
@@ -154,6 +154,8 @@ def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> Store
             raise DatasetError(
                 f"{folder / MANIFEST} is of another blueprint than {PLAN}: the folder mixes two datasets"
             )
+        if not lists_shards_of(manifest, blueprint):
+            raise DatasetError(f"{folder / MANIFEST} lists other shards than {PLAN}")
         return StoredDataset(folder, blueprint, manifest)
     if not allow_incomplete:
         raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_incomplete=True))}")

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, shard_attributes, shards
-from cnpgen.store.fates import Fates, fates_from_json
+from cnpgen.store.fates import FATES_FORM, Fates, fates_from_json
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import load_document, save_document
+from cnpgen.store.files.forms import EVERY, NUMBER, TEXT, WHOLE, check_form
 from cnpgen.store.layout import WORK
 from cnpgen.store.shard import write_shard
-from cnpgen.store.statistics import FieldStatistics, column_statistics, statistics_from_json
+from cnpgen.store.statistics import STATISTICS_FORM, FieldStatistics, column_statistics, statistics_from_json
 
 FORMAT = "cnpgen-shard-record"
 FORMAT_VERSION = 1
@@ -51,6 +52,14 @@ class ShardRecord:
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
+FORM = {
+    **dict.fromkeys(("file", "sha256", "plan_fingerprint", "started"), TEXT),
+    **dict.fromkeys(("bytes", "rows", "first_sample_id"), WHOLE),
+    "seconds": NUMBER,
+    "versions": {EVERY: TEXT},
+    "outcome": FATES_FORM,
+    "statistics": {EVERY: STATISTICS_FORM},
+}
 _PLAIN = ("file", "bytes", "sha256", "rows", "first_sample_id", "plan_fingerprint", "started", "seconds", "versions")
 
 
@@ -70,11 +79,12 @@ def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
         DatasetError: A key is missing or has the wrong type.
     """
     try:
+        check_form(content, FORM)
         statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
         fates = fates_from_json(content["outcome"])
         return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, fates=fates)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(f"the shard's record is damaged: {type(error).__name__} {error}") from error
+    except ValueError as error:
+        raise DatasetError(f"the shard's record is damaged: {error}") from error
 
 
 def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
@@ -95,7 +105,7 @@ def load_record(folder: Path, task: ShardTask) -> ShardRecord:
         MachineError: The system would not let us read it.
     """
     path = folder / task.sidecar
-    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION))
+    record = record_from_json(load_document(path, FORMAT, version=FORMAT_VERSION, form=FORM))
     found = (record.file, record.rows, record.first_sample_id)
     if found != (task.file, task.rows, task.first_row):
         raise DatasetError(f"{path} is the record of another shard: {found[0]}, {found[1]} rows from row {found[2]}")

@@ -84,7 +84,7 @@ def write_shard(
     with committing(path, work) as temporary:
         temporary.write_bytes(content)
         with opened_hdf5(temporary) as file:
-            shapes = {name: item.shape for name, item in file.items()}
+            shapes = {name: item.shape for name, item in file.columns().items()}
         if shapes != {field.name: _shape(field, rows) for field in fields}:
             raise DatasetError(f"{path} was not written as it was meant: found {shapes}")
     return len(content)
@@ -146,13 +146,11 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
         for name in fields or ():
             if name not in known:
                 raise DatasetError(f"{path} has no field {name!r}{nearest(name, known)}")
-        return {name: file[name][()] for name in (known if fields is None else fields)}
+        return {name: file[name].read() for name in (known if fields is None else fields)}
 
 
 def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
     """Read a shard's file attributes.
-
-    HDF5 2.0 can hang on a text of a file that was changed: compare the file's sha256 before, or ask for numbers only.
 
     Args:
         path: The shard.
@@ -166,7 +164,7 @@ def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str,
         MachineError: The system would not let us read it.
     """
     with opened_hdf5(path) as file:
-        values = {name: file.attrs[name] for name in (file.attrs if names is None else names)}
+        values = {name: file.attributes[name] for name in (file.attributes if names is None else names)}
         return {name: value if isinstance(value, str) else int(value) for name, value in values.items()}
 
 
@@ -175,13 +173,13 @@ class StoredField:
     """What a shard says about one of its datasets.
 
     Attributes:
-        shape: Shape of the dataset; empty for what is no dataset.
+        shape: Shape of the dataset.
         dtype: Its stored type.
         attributes: Its attributes.
     """
 
     shape: tuple[int, ...]
-    dtype: np.dtype[Any] | None
+    dtype: np.dtype[Any]
     attributes: dict[str, Any]
 
 
@@ -193,10 +191,8 @@ def read_schema(path: Path) -> dict[str, StoredField]:
         MachineError: The system would not let us read it.
     """
     with opened_hdf5(path) as file:
-        return {
-            name: StoredField(getattr(item, "shape", ()), getattr(item, "dtype", None), dict(item.attrs))
-            for name, item in file.items()
-        }
+        columns = file.columns()
+        return {name: StoredField(item.shape, item.dtype, item.attributes.all()) for name, item in columns.items()}
 
 
 @dataclass(frozen=True)
@@ -215,12 +211,16 @@ class Placement:
     offset: int | None
 
 
-def read_placements(path: Path) -> dict[str, Placement]:
-    """Read where a shard keeps its fields, so that they can be mapped into memory.
+def read_placements(path: Path) -> tuple[dict[str, Placement], dict[str, int]]:
+    """Read where a shard keeps its fields, so that they can be mapped into memory, and which shard it is.
+
+    Returns:
+        Field name -> its place; and the file's attributes ``plan_key``, ``first_sample_id`` and ``rows``.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off.
         MachineError: The system would not let us read it.
     """
     with opened_hdf5(path) as file:
-        return {name: Placement(item.shape, item.dtype, item.id.get_offset()) for name, item in file.items()}
+        places = {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}
+        return places, {name: int(file.attributes[name]) for name in ("plan_key", "first_sample_id", "rows")}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
+from cnpgen.store.files.forms import NUMBER, WHOLE, check_form
 
 Floats = NDArray[np.float64]
 N_BINS = 64
@@ -95,15 +96,39 @@ def _alike(a: FieldStatistics, b: FieldStatistics) -> bool:
     return np.array_equal(a.low, b.low) and np.array_equal(a.high, b.high)
 
 
+STATISTICS_FORM = {"count": WHOLE, "mean": [NUMBER], "m2": [NUMBER], "min": [NUMBER], "max": [NUMBER]}
+_HISTOGRAM_FORM = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
+
+
 def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
-    """Rebuild statistics from their JSON form."""
+    """Rebuild statistics from their JSON form.
+
+    Args:
+        content: What has the form ``STATISTICS_FORM``.
+
+    Raises:
+        ValueError: They cannot be those of any field.
+    """
     arrays = {name: np.array(content[name], np.float64) for name in ("mean", "m2")}
     arrays |= {name + "imum": np.array(content[name], np.float64) for name in ("min", "max")}
     counts = None
     if (histogram := content.get("histogram")) is not None:
+        check_form(histogram, _HISTOGRAM_FORM)
         arrays |= {name: np.array(histogram[name], np.float64) for name in ("low", "high")}
         counts = np.array(histogram["counts"], np.int64)
-    return FieldStatistics(count=int(content["count"]), histogram=counts, **arrays)
+    found = FieldStatistics(count=int(content["count"]), histogram=counts, **arrays)
+    columns = len(found.mean)
+    if found.count < 1 or any(array.shape != (columns,) for array in arrays.values()):
+        raise ValueError(f"statistics must be of rows, and all of {columns} columns")
+    if counts is not None and (counts.ndim != 2 or len(counts) != columns):
+        raise ValueError(f"a histogram must have {columns} columns, got shape {counts.shape}")
+    return found
+
+
+def are_of(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> bool:
+    """Whether statistics are of these fields and of as many columns as they have."""
+    columns = {name: len(found.mean) for name, found in statistics.items()}
+    return columns == {field.name: max(field.width, 1) for field in fields}
 
 
 def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:

@@ -8,13 +8,20 @@ from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.blueprint import Blueprint, ShardTask, shards
-from cnpgen.store.fates import Fates, densities_to_json, merge_fates
+from cnpgen.store.fates import DENSITIES_FORM, Fates, densities_to_json, merge_fates
+from cnpgen.store.files.forms import EVERY, TEXT
 from cnpgen.store.intact import AGAIN
+from cnpgen.store.layout import PLAN
 from cnpgen.store.record import ShardRecord, load_committed
-from cnpgen.store.statistics import FieldStatistics, merge_statistics
+from cnpgen.store.statistics import STATISTICS_FORM, FieldStatistics, are_of, merge_statistics
 
 STATS_FORMAT = "cnpgen-stats"
 STATS_FORMAT_VERSION = 1
+STATS_FORM = {
+    "plan_fingerprint": TEXT,
+    "splits": {EVERY: {EVERY: STATISTICS_FORM}},
+    "densities": {EVERY: DENSITIES_FORM},
+}
 _N_SHOWN = 5
 
 
@@ -73,7 +80,7 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = Fa
     records, problems = [], []
     for task in shards(blueprint):
         try:
-            records.append((task, load_committed(folder, task, blueprint.of(task).fingerprint)))
+            records.append((task, _fitting(folder, blueprint, task)))
         except DatasetError as error:
             problems.append(str(error))
     summary = Summary(blueprint, tuple(records), tuple(problems))
@@ -82,6 +89,14 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = Fa
         shown = "\n  ".join([*problems[:_N_SHOWN], *more])
         raise DatasetError(f"{folder} is {unfinished(summary)}:\n  {shown}")
     return summary
+
+
+def _fitting(folder: Path, blueprint: Blueprint, task: ShardTask) -> ShardRecord:
+    """Read a sidecar, which must be of the blueprint's fields."""
+    record = load_committed(folder, task, blueprint.of(task).fingerprint)
+    if not are_of(record.statistics, blueprint.fields):
+        raise DatasetError(f"{folder / task.sidecar} has statistics of other fields than {PLAN}")
+    return record
 
 
 def unfinished(summary: Summary) -> str:

@@ -217,6 +217,27 @@ class SymbolicState:
         """Linear acceleration of the tip [m/s^2]."""
         return add(tip_velocity(self.kinematics, self.ddq), bias_acceleration(self.kinematics, self.dq))
 
+    @cached_property
+    def tip_angular_velocity(self) -> Vec:
+        """Angular velocity of the tip [rad/s]."""
+        return self._turning[0]
+
+    @cached_property
+    def tip_angular_acceleration(self) -> Vec:
+        """Angular acceleration of the tip [rad/s^2]."""
+        return self._turning[1]
+
+    @cached_property
+    def _turning(self) -> tuple[Vec, Vec]:
+        omega: Vec = [0.0, 0.0, 0.0]
+        alpha: Vec = [0.0, 0.0, 0.0]
+        kin = self.kinematics
+        for z, rate, rate2, turns in zip(kin.axes, self.dq, self.ddq, kin.turning, strict=True):
+            if turns:
+                alpha = add(alpha, add(scale(z, rate2), scale(cross(omega, z), rate)))
+                omega = add(omega, scale(z, rate))
+        return omega, alpha
+
     @property
     def segments(self) -> list[tuple[Vec, Vec]]:
         """The moving segments of the robot's skeleton: pairs of points [m]."""
@@ -242,6 +263,14 @@ def symbols(name: str, width: int) -> tuple[Any, Vec]:
 
     column = ca.SX.sym(name, width)
     return column, ca.vertsplit(column)
+
+
+def tip_position(robot: "Robot") -> Any:
+    """Build ``q -> p``, the tip's position [m], as an SX function."""
+    import casadi as ca
+
+    q_sx, q = symbols("q", robot.n)
+    return ca.Function("tip_position", [q_sx], [ca.vertcat(*forward_kinematics(robot.chain, q).tip)])
 
 
 def _turn(joint: Joint, angle: Scalar) -> list[Vec]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files.documents import differences
+from cnpgen.store.files.documents import differences, parse_json
 from cnpgen.store.files.sealed import read_sealed, write_sealed
 from cnpgen.training.state import State, from_content, to_content
 
@@ -55,7 +55,7 @@ class Checkpoints:
     def _load(self) -> State:
         content = read_sealed(self.path, kind=KIND, version=VERSION)
         try:
-            found, state = json.loads(content.texts["identity"]), from_content(content)
+            found, state = parse_json(content.texts["identity"]), from_content(content)
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
         changed = list(map(str, differences(found, self.identity)))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.store.files.atomic import machine_error, write_file
+from cnpgen.store.files.documents import parse_json
 
 OURS = {"step", "epoch", "learning_rate", "seconds", "lost"}  # keys of the first line of every log
 
@@ -50,7 +51,7 @@ def is_log(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             first = file.readline(1 << 16)
-        record = json.loads(first or "null")
+        record = parse_json(first.decode() or "null")
     except (OSError, ValueError):
         return False
     return not first or (isinstance(record, dict) and record.keys() >= OURS)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, WHOLE, check_form
 from cnpgen.store.files.sealed import Content
 from cnpgen.training.adam import Adam, start_adam
 from cnpgen.training.clipping import Clipping
@@ -130,16 +132,30 @@ def to_content(state: State) -> Content:
     return Content({**arrays, "best": best.parameters, "terms": state.sums.terms}, texts)
 
 
+_FORM = {
+    **dict.fromkeys(("step", "steps", "imitating"), WHOLE),
+    **dict.fromkeys(("seconds", "checking"), NUMBER),
+    "clipping": {"sample": NUMBER, "batch": NUMBER},
+    "metric": {EVERY: ANYTHING},
+    "sums": {"steps": WHOLE, "lost": WHOLE, "distance": NUMBER, "imitating": WHOLE},
+    "best": {"score": NUMBER, "step": WHOLE},
+}
+
+
 def from_content(content: Content) -> State:
     """Put a state together again.
 
     Raises:
         KeyError: Something is missing.
-        ValueError: Likewise.
+        TypeError: Something is there that this version does not know.
+        ValueError: Something is not what it was.
     """
-    numbers, arrays = json.loads(content.texts["numbers"]), content.arrays
-    names = ("parameters", "average", "first", "second")
-    best = numbers["best"]
+    numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
+    check_form(numbers, _FORM)
+    names, best = ("parameters", "average", "first", "second"), numbers["best"]
+    shapes = {arrays[name].shape for name in (*names, "best")}
+    if len(shapes) > 1 or len(shapes.pop()) != 1 or arrays["terms"].ndim != 1:
+        raise ValueError("its arrays are not those of one network")
     return State(
         Adam(**{name: np.array(arrays[name]) for name in names}, step=numbers["step"]),
         Clipping(**numbers["clipping"]),

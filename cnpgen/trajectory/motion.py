@@ -200,6 +200,10 @@ class Motion:
                     break
         return np.where(t >= known[:, -1:], 1.0, low + ahead)
 
+    def at_times(self, t: Array) -> States:
+        """Evaluate the motions at times t [s], shape (K,) or (N, K), clipped to the motion; see ``at``."""
+        return self.at(self.phase_at(t))
+
     def slower(self, factor: Array | float) -> "Motion":
         """Slow the motions down uniformly: the path stays, the rate is divided by ``factor``.
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+HUGE = 1e150  # control points beyond it are scaled before their products, which would be infinite, are taken
+
 
 def clamped_knots(points: int, degree: int) -> Array:
     """Return the knot vector of the paper's Appendix A, shape (points + degree + 1,)."""
@@ -28,11 +30,54 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     Returns:
         Shape (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of the spline.
     """
-    from scipy.interpolate import BSpline
+    knots, worth = derivative(points, degree, order)
+    degree -= order
+    first = np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(worth) - 1) - degree
+    values = np.zeros((len(s), points))
+    for k, weight in enumerate(_cox_de_boor(s, knots, degree, first)):
+        values += weight[:, None] * worth[first + k]
+    return values
 
-    spline = BSpline(clamped_knots(points, degree), np.eye(points), degree)
-    values: Array = spline.derivative(order)(s) if order else spline(s)
-    return np.ascontiguousarray(values)
+
+def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
+    """Return the knots of a derivative of a spline, and the matrix that turns its control points into the derivative's.
+
+    Args:
+        points: Number of control points C.
+        degree: Degree D.
+        order: Order of the derivative with respect to s, at most D.
+
+    Returns:
+        ``(knots, matrix)``: shapes (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is D - order.
+    """
+    knots, matrix = clamped_knots(points, degree), np.eye(points)
+    for p in range(degree, degree - order, -1):
+        matrix = np.diff(matrix, axis=0) * p / (knots[p + 1 : -1] - knots[1 : -p - 1])[:, None]
+        knots = knots[1:-1]
+    return knots, matrix
+
+
+def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -> Array:
+    """Evaluate the D + 1 basis functions that are not 0 at phases s, by the recursion that SciPy uses, too.
+
+    Args:
+        s: Phases, shape (K,).
+        knots: Knots.
+        degree: Degree D.
+        first: Index of the first of these basis functions at every phase, shape (K,).
+
+    Returns:
+        Shape (D + 1, K).
+    """
+    weights = np.ones((1, len(s)))
+    right = first + degree + 1 + np.arange(degree)[:, None]
+    for p in range(1, degree + 1):
+        high, low = knots[right[:p]], knots[right[:p] - p]
+        share = weights / (high - low)
+        weights = np.zeros((p + 1, len(s)))
+        weights[1:] = share * (s - low)
+        weights[:-1] += share * (high - s)
+    return weights
 
 
 def pieces(control: Array, degree: int) -> Array:
@@ -95,10 +140,11 @@ def extremes(control: Array, degree: int) -> tuple[Array, Array]:
     """Return where on [0, 1] one spline of finite control points, shape (C,), ends or turns, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
-    spline = BSpline(clamped_knots(len(control), degree), control, degree)
+    scale = 2.0**-600 if np.abs(control).max() > HUGE else 1.0  # a power of two, which changes no digit
+    spline = BSpline(clamped_knots(len(control), degree), control * scale, degree)
     turning = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
     s = np.clip(np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]]), 0, 1)
-    return s, np.asarray(spline(s))
+    return s, np.asarray(spline(s)) / scale
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from cnpgen.store.check import REPLACE, Finding
 from cnpgen.store.files.documents import load_document, plain
 from cnpgen.store.intact import AGAIN
 from cnpgen.store.layout import PLAN, STATS
-from cnpgen.store.summary import STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
+from cnpgen.store.summary import STATS_FORM, STATS_FORMAT, STATS_FORMAT_VERSION, stats_document, summarise
 
 
 def check_recipe(blueprint: Blueprint) -> list[Finding]:
@@ -28,7 +28,7 @@ def check_recipe(blueprint: Blueprint) -> list[Finding]:
 def check_statistics(folder: Path, blueprint: Blueprint) -> list[Finding]:
     """Check that ``stats.json`` sums up the records of the shards, all of which must be there."""
     try:
-        document = load_document(folder / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+        document = load_document(folder / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION, form=STATS_FORM)
         expected = plain(stats_document(summarise(folder, blueprint)))
     except DatasetError:  # missing or damaged: found already
         return []

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, counted
+from cnpgen.judges.rows.hits import HitRule, hit_rule, repeated_share, shares_of
 from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.judges.rows.report import RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
@@ -68,6 +69,7 @@ def check_rows(
     twice = len(every) - len(np.unique(every))
     if twice:
         findings.append(Finding("(all splits)", f"{counted(twice, 'row')} that stand in the dataset before, too"))
+    findings += [Finding("(all splits)", text) for text in _slowed_down(blueprint, checks)]
     reports = [check.report for check in checks if check.report is not None]
     judged, valid = (sum(getattr(check.plans, what) for check in checks) for what in ("judged", "valid"))
     return DeepCheck(merge(reports) if reports else None, judged, valid, tuple(findings))
@@ -82,12 +84,14 @@ class _ShardCheck:
         problems: What is wrong with it.
         keys: A hash of the boundary states of every row, shape (rows,).
         plans: What the verdict says of its plans.
+        shares: Which fraction of the highest possible speed its hits have, shape (rows,); none if they are no hits.
     """
 
     report: RowReport | None
     problems: list[str]
     keys: NDArray[np.uint64]
     plans: PlanCheck
+    shares: NDArray[np.float64]
 
 
 def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _ShardCheck:
@@ -96,11 +100,11 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
         columns = read_shard(folder / task.file)
         record = load_record(folder, task)
     except CnpgenError as error:
-        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck())
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0))
     with restored(blueprint) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
-        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype)
+        report = verify_rows(problem, robot, columns, dtype=blueprint.dtype, rule=_rule(blueprint))
         plans = check_plans(problem, robot, columns)
     problems = [*plans.problems, *check_numbers(blueprint, task, columns, record)]
     problems += [
@@ -109,7 +113,23 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
         for check in report.failed
     ]
     ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
-    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans)
+    shares = shares_of(columns) if {"hit_speed", "hit_speed_max"} <= columns.keys() else np.empty(0)
+    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, shares)
+
+
+def _rule(blueprint: Blueprint) -> HitRule:
+    """Return what the recorded stages say of the goals of hits."""
+    return hit_rule(blueprint.recipe["pipeline"]["stage"])
+
+
+def _slowed_down(blueprint: Blueprint, checks: list[_ShardCheck]) -> list[str]:
+    """Say that more hits have the same fraction of their highest speed than luck gives them."""
+    shares = np.concatenate([np.empty(0), *(check.shares for check in checks)])
+    if _rule(blueprint).full_speed is None:
+        return []
+    count, share = repeated_share(shares, blueprint.dtype)
+    same = f"{counted(count, 'hit')} with the same fraction of their highest speed, {share:.6g}"
+    return [f"{same}, which is drawn for each: they were slowed down afterwards"] if count else []
 
 
 def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:

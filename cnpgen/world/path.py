@@ -57,7 +57,7 @@ class PathWorld:
         self._model = robot.model
         self._data = self._model.createData()
         self._pool = pin.ModelPool(self._model, 1)
-        self._tip = self._model.getFrameId(robot.tip)
+        self._tip = robot.tip_frame
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
         self._object_size = None if object_size is None else np.array(object_size)
         self._scene = Scene(obstacles, object_size, 1)

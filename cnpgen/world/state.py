@@ -45,7 +45,7 @@ class World:
         self._model = robot.model
         self._data = self._model.createData()
         self._dynamics_data = self._model.createData()  # RNEA's accelerations include gravity: kept apart
-        self._tip = self._model.getFrameId(robot.tip)
+        self._tip = robot.tip_frame
         self._object_size = object_size
         self._scene = Scene(obstacles, object_size, len(robot.skeleton))
         self._skeleton = robot.skeleton
@@ -101,6 +101,22 @@ class World:
 
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).linear)
+
+    @property
+    def tip_angular_velocity(self) -> Array:
+        """Angular velocity of the tip [rad/s], shape (3,)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).angular)
+
+    @property
+    def tip_angular_acceleration(self) -> Array:
+        """Angular acceleration of the tip [rad/s^2], shape (3,)."""
+        import pinocchio as pin
+
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return np.array(pin.getFrameAcceleration(self._model, self._data, self._tip, frame).angular)
 
     @property
     def tip_jacobian(self) -> Array:

@@ -64,7 +64,7 @@ def architecture_of(given: Surroundings, rows: Rows, settings: TrainingSettings)
 def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
     """A model of a problem with random parameters: plans are bad, but plans."""
     given = surroundings_of(name)
-    kit = make_kit(given, bending_steps=1, landing_steps=1, slow_down=False)
+    kit = make_kit(given, bending_steps=0, landing_steps=0, slow_down=False)  # of which preparing takes nothing else
     rows, features = prepare_rows(boundary, kit.prepare)
     architecture = architecture_of(given, rows, SMALL)
     options = {

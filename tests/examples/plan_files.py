@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from cnpgen.plans import Plans, make_plans
+from cnpgen.store.files.sealed import BLOCK
 from cnpgen.trajectory.motion import Motion
 from tests.examples.plans import Plan, bent, joined, load
 
@@ -21,6 +23,13 @@ def plans_of(*plans: Plan, sample_id: Sequence[int] | None = None) -> Plans:
         columns={"start_xyz": start_xyz, "goal_xyz": goal_xyz},
         sample_id=sample_id,
     )
+
+
+def unsealed(path: Path) -> Path:
+    """Take the checksum off a file of plans, so that it may be changed."""
+    with path.open("r+b") as file:
+        file.write(bytes(BLOCK))
+    return path
 
 
 def _still(plan: Plan) -> Plan:

@@ -1,26 +1,51 @@
-"""Faults in large numbers: ``python -m tests.faults --kills 200 --seed 1``; the exit code is 1 if any is found."""
+"""Faults in large numbers: ``python -m tests.faults --kills 200 --inputs 100000``; the exit code is 1 if any is found."""
 
 import argparse
 import sys
 
+from tests.faults.fuzz import fuzz
 from tests.faults.kills import kill
+from tests.faults.subjects import SUBJECTS
 
 
 def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parser.add_argument(
-        "--kills", metavar="N", type=int, default=0, help="processes to kill; what they did is started again"
-    )
+    parser.add_argument("--inputs", metavar="N", type=int, default=0, help="changed files to read")
+    parser.add_argument("--kills", metavar="N", type=int, default=0, help="processes to kill; their runs go on")
     parser.add_argument("--seed", metavar="S", type=int, default=0, help="seed of everything")
-    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first one")
+    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input or run")
+    parser.add_argument("--kind", choices=tuple(SUBJECTS), action="append", help="only files of this kind")
     arguments = parser.parse_args()
+    return max(inputs(arguments) if arguments.inputs else 0, kills(arguments) if arguments.kills else 0)
+
+
+def inputs(arguments: argparse.Namespace) -> int:
+    """Read changed files."""
+    outcome = fuzz(
+        arguments.inputs,
+        seed=arguments.seed,
+        first=arguments.first,
+        kinds=tuple(arguments.kind or SUBJECTS),
+        progress=lambda done: print(f"{done:,} inputs", flush=True) if done % 1000 == 0 else None,
+    )
+    for kind in SUBJECTS:
+        print(f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused")
+    return _told(outcome.findings)
+
+
+def kills(arguments: argparse.Namespace) -> int:
+    """Kill processes."""
     killed = kill(arguments.kills, seed=arguments.seed, first=arguments.first)
     for what, count in sorted(killed.runs.items()):
         print(f"{count:>6,} {what}")
     print(f"{killed.struck:>6,} processes struck")
-    print(f"{len(killed.findings)} findings", *killed.findings, sep="\n")
-    return 1 if killed.findings else 0
+    return _told(killed.findings)
+
+
+def _told(findings: list[str]) -> int:
+    print(f"{len(findings)} findings", *findings, sep="\n")
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":

@@ -5,8 +5,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from cnpgen.judges.plans import Margin
-from cnpgen.judges.plans.closer import intervals, keep_worse
+from cnpgen.judges.plans.closer import BOWED, Intervals
 from tests.examples.plans import bent, load
 
 judge_module = import_module("cnpgen.judges.plans.judge")  # the package has a function of the same name
@@ -18,13 +17,13 @@ def test_where_edges_pass_each_other_between_two_moments_the_peak_is_found(
 ) -> None:
     plan = bent(load("dragging"), by, seed=seed)
     found = plan.judged()
-    monkeypatch.setattr(judge_module, "look_closer", lambda *_: [])
+    monkeypatch.setattr(judge_module, "look_closer", lambda _: iter(()))
     coarse, fine = plan.judged(), plan.judged(step=2e-5)
     deepest = fine.margins["object contact"].excess
     assert deepest - coarse.margins["object contact"].excess > 1e-4
     assert found.margins["object contact"].excess == pytest.approx(deepest, abs=1e-5)
     assert found.margins["object contact"].time == pytest.approx(fine.margins["object contact"].time, abs=1e-4)
-    others = [{name: margin for name, margin in v.margins.items() if name != "object contact"} for v in (found, coarse)]
+    others = [{name: margin for name, margin in v.margins.items() if margin.unit != "m"} for v in (found, coarse)]
     assert others[0] == others[1]
     assert found.metrics.to_dict() == coarse.metrics.to_dict()
     assert found.paper == coarse.paper
@@ -45,36 +44,42 @@ def test_a_peak_far_from_the_deepest_moment_is_found_where_it_decides(seed: int,
     assert found.time == pytest.approx(deepest.time, abs=step)
 
 
-def moving(distances: list[float], ways: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances from one obstacle, and the corners of an object that moves by so much from moment to moment."""
-    corners = np.zeros((8, 3, len(distances)))
-    corners[:, 0] = np.concatenate([[0.0], np.cumsum(ways)])
-    return np.array([distances]), corners
+def between(room: list[float], ways: list[float]) -> Intervals:
+    """Intervals between moments at which one pair of bodies has so much room; so far they move from one to the next."""
+    moments, values = np.linspace(0, 1, len(room)), np.array(room)
+    ends = [np.column_stack([each[:-1], each[1:]]) for each in (moments, values)]
+    return Intervals(ends[0], ends[1][None], np.array(ways))
 
 
-def test_intervals_beside_the_deepest_moment_and_those_that_could_hide_too_much_are_chosen() -> None:
-    distances = [5.0, 1.0, 3.0, 3.0, 2.0, 2.0, 9.0, 9.0]
-    assert intervals(*moving(distances, [1.0] * 7), 0.0).tolist() == [0, 1]
-    assert intervals(*moving(distances, [1.0, 1.0, 1.0, 1.0, 4.1, 1.0, 18.1]), 0.0).tolist() == [0, 1, 4, 6]
-    assert intervals(*moving(distances, [1.0, 1.0, 1.0, 1.0, 3.9, 1.0, 17.9]), 0.0).tolist() == [0, 1]
+def test_intervals_beside_the_deepest_moment_are_divided() -> None:
+    assert between([5.0, 1.0, 3.0, 3.0], [1.0] * 3).deepest().tolist() == [True, True, False]
+    assert between([1.0, 2.0, 3.0], [0.0] * 2).deepest().tolist() == [True, False]
+    assert between([3.0, 2.0, 1.0], [0.0] * 2).deepest().tolist() == [False, True]
 
 
-def test_where_the_deepest_moment_is_too_deep_already_nothing_else_is_looked_into() -> None:
-    assert intervals(*moving([5.0, -1.0, 3.0, 3.0, 2.0], [50.0] * 4), -0.5).tolist() == [0, 1]
+def test_intervals_that_could_hide_more_than_is_allowed_are_divided() -> None:
+    room = [5.0, 1.0, 3.0, 3.0, 2.0, 2.0, 9.0, 9.0]
+    assert not between(room, [1.0] * 7).hiding().any()
+    assert np.flatnonzero(between(room, [1.0, 1.0, 1.0, 1.0, 4.0, 1.0, 18.0]).hiding()).tolist() == [4, 6]
+    assert not between(room, [1.0, 1.0, 1.0, 1.0, 3.9, 1.0, 17.8]).hiding().any()
 
 
-def test_at_either_end_there_is_one_interval_and_nan_is_no_trouble() -> None:
-    assert intervals(*moving([1.0, 2.0, 3.0], [0.0] * 2), 0.0).tolist() == [0]
-    assert intervals(*moving([3.0, 2.0, 1.0], [0.0] * 2), 0.0).tolist() == [1]
-    assert intervals(*moving([3.0, np.nan, 1.0], [9.0] * 2), 0.0).tolist() == [0, 1]
+def test_what_bends_more_than_a_straight_line_is_counted_in() -> None:
+    assert between([1.0, 1.0], [2.0]).hiding().all()
+    assert not between([1.0, 1.0], [2.0 / BOWED - 1e-9]).hiding().any()
+
+
+def test_where_more_than_is_allowed_is_exceeded_anyway_nothing_is_searched() -> None:
+    assert not between([5.0, -0.1, 3.0], [50.0] * 2).hiding().any()
+    assert not between([5.0, np.nan, 3.0], [50.0] * 2).hiding().any()
 
 
 def test_of_more_intervals_than_can_be_looked_into_those_that_hide_most_are_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("cnpgen.judges.plans.closer.MOST", 2)
-    distances, corners = moving([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [9.0, 9.0, 20.0, 9.1, 30.0])
-    assert intervals(distances, corners, 0.0).tolist() == [0, 2, 4]
+    found = between([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [9.0, 9.0, 20.0, 9.1, 30.0]).hiding()
+    assert np.flatnonzero(found).tolist() == [2, 4]
 
 
 def test_a_peak_at_either_end_is_no_trouble() -> None:
@@ -88,15 +93,3 @@ def test_a_peak_at_either_end_is_no_trouble() -> None:
         margin = verdict.margins["object contact"]
         assert margin.excess == pytest.approx(0.0095, abs=1e-3)
         assert (margin.phase < 0.5) == (ends[0] > 0)
-
-
-def contact(excess: float, reason: str = "object in collision") -> Margin:
-    return Margin("object contact", reason, "m", "", -excess, 0.0, excess, 1e-3, 0.0, 0.0)
-
-
-def test_of_both_looks_the_more_severe_margin_is_kept() -> None:
-    other = Margin("tilt", "not vertical", "rad", "x", 0.1, 0.0, 0.1, 0.03, 0.0, 0.0)
-    margins = [other, contact(1e-4), contact(5e-4)]
-    assert keep_worse(margins, []) == margins
-    assert keep_worse(margins, [contact(2e-4), contact(4e-4)]) == [other, contact(2e-4), contact(5e-4)]
-    assert keep_worse(margins, [contact(9e-4, "another"), contact(8e-4)]) == [other, contact(8e-4), contact(5e-4)]

@@ -259,7 +259,7 @@ def test_a_shard_that_is_not_whole_is_noticed_when_the_dataset_is_opened(copy: P
 def test_a_changed_byte_among_the_numbers_is_noticed_when_the_shard_is_read(copy: Path) -> None:
     path = copy / "train" / "shard-00001.h5"
     content = bytearray(path.read_bytes())
-    content[(read_placements(path)["start_q"].offset or 0) + 3] ^= 1
+    content[(read_placements(path)[0]["start_q"].offset or 0) + 3] ^= 1
     path.write_bytes(content)
     dataset = load_dataset(copy)
     with pytest.raises(DatasetError, match=r"shard-00001\.h5 is damaged: its sha256 is not the recorded one"):

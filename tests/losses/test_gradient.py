@@ -9,6 +9,7 @@ import pytest
 from cnpgen.losses.plan_loss import LossValue, PlanLoss
 from cnpgen.schema.keys import Range
 from tests.examples.losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
+from tests.examples.manifolds import LIMITS, MANIFOLDS, problem_on
 from tests.examples.plans import PROBLEMS
 
 CASES = [(label, term, "signed") for label in ("hit", "transport") for term in loss(PROBLEM_OF[label]).terms]
@@ -58,6 +59,17 @@ def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_diffe
     value = given.evaluated(of, **options)
     assert (value.terms[:, of.terms.index(term)] > 0).any()
     check_along_random_directions(given, of, value, random, **options)
+
+
+@pytest.mark.parametrize("name", sorted(MANIFOLDS))
+def test_the_gradient_of_every_manifold_is_that_of_central_differences(name):
+    of = PlanLoss(problem_on(name), dtype="float64", backend="numpy", nodes=16)
+    some, random = batch("transport", 3, by=0.5, seed=1), np.random.default_rng(3)
+    given = Batch(some.problem, some.path, some.rate, np.zeros((3, 0)))
+    for term in of.terms[1 + len(LIMITS) :]:
+        value = given.evaluated(of, weights=weights_of(of, term))
+        assert (value.terms[:, of.terms.index(term)] > 0).any()
+        check_along_random_directions(given, of, value, random, weights=weights_of(of, term))
 
 
 @pytest.mark.parametrize("start", [0.163, 0.19], ids=["in the band", "beyond it"])

@@ -1,5 +1,7 @@
 """Model files: what is written comes back; what is damaged, cut off, or of something else is an error."""
 
+import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,6 +104,64 @@ def test_a_sealed_file_that_does_not_fit_is_an_error_too(model, tmp_path, change
     path.write_bytes(seal(Content(arrays, texts), kind=model_file.KIND, version=1))
     with pytest.raises(DatasetError, match="does not fit this version"):
         load_model(path)
+
+
+def described(part, **values):
+    def apply(arrays, texts):
+        description = json.loads(texts["description"])
+        (description[part] if part else description).update(values)
+        texts["description"] = json.dumps(description)
+
+    return apply
+
+
+FORGERIES = {
+    "as many steps as never end": (
+        described("meaning", landing_steps=10**18), "there are at most 20 steps"),
+    "an infinite scale": (described("meaning", path_scale="inf"), "cannot be meant"),
+    "layers without end": (described("architecture", layers=10**30), "layers must be a whole"),
+    "many layers": (described("architecture", layers=10**9), "1000000000 layers cannot be in"),
+    "a wide layer": (described("architecture", hidden=10**9), "must have shape"),
+    "no layer": (described("architecture", layers=0), "at least 1 of layers, got 0"),
+    "other inputs": (described("architecture", inputs=3), "inputs, path outputs and rate"),
+    "a text for a number": (described("architecture", hidden="16"), "hidden must be a whole"),
+    "another key": (described("meaning", more=1), "unexpected keyword argument 'more'"),
+    "no features": (described("", features=[]), "inputs, path outputs and rate outputs"),
+    "a layer that is missing": (lambda arrays, texts: arrays.pop("trunk_1_bias"), "it has no 'trunk_1_bias'"),
+    "another mean": (lambda arrays, texts: arrays.update(feature_mean=np.zeros(3)), "feature_mean must have shape"),
+    "training that is a list": (lambda arrays, texts: texts.update(training="[1]"), "the document must be a table"),
+    "a dataset that is a number": (
+        lambda arrays, texts: texts.update(training='{"dataset": 1}'), "dataset must be a table, got 1"),
+    "deep training": (lambda arrays, texts: texts.update(training="[" * 10**5), "tables and lists in one another"),
+    "no problem": (lambda arrays, texts: texts.update(problem_recipe="{}"), "the recipe is not that of a problem"),
+    "no text": (lambda arrays, texts: arrays.update(log=np.array([255], np.uint8)), "a text that is not UTF-8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", FORGERIES)
+def test_what_a_model_declares_is_compared_with_what_it_has(model, tmp_path, what):
+    forge, message = FORGERIES[what]
+    content = model_file.model_content(model)
+    arrays, texts = dict(content.arrays), dict(content.texts)
+    texts.pop("log") if what == "no text" else None
+    forge(arrays, texts)
+    path = tmp_path / "forged.h5"
+    path.write_bytes(seal(Content(arrays, texts), kind=model_file.KIND, version=1))
+    begun = time.process_time()
+    with pytest.raises(DatasetError, match=rf"forged\.h5 .*{message}"):
+        load_model(path)
+    assert time.process_time() - begun < 2
+
+
+def test_every_bit_of_the_first_block_counts(model, tmp_path):
+    save_model(tmp_path / "m.h5", model)
+    whole = (tmp_path / "m.h5").read_bytes()
+    for place in range(0, 512, 7):
+        data = bytearray(whole)
+        data[place] ^= 1 << (place % 8)
+        (tmp_path / "m.h5").write_bytes(data)
+        with pytest.raises(DatasetError, match=r"m\.h5"):
+            load_model(tmp_path / "m.h5")
 
 
 def test_an_empty_text_and_a_scalar_come_back(tmp_path):

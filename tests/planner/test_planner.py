@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.record import record_problem
+from cnpgen.refine.plans import refine_plans
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
@@ -66,6 +68,32 @@ def test_tip_positions_are_those_of_pinocchio(planner, rows):
     plans = planned(planner, rows)
     for end, q in (("start", rows.start_q), ("goal", rows.goal_q)):
         np.testing.assert_allclose(plans.columns[f"{end}_xyz"], plans.problem.tip_positions(q), atol=1e-12)
+
+
+@pytest.mark.parametrize("part", [0.1, 0.6, 0.9, 0.99])
+def test_replanning_to_a_goal_that_has_not_moved_never_takes_longer_than_what_was_left(part):
+    planner, rows = Planner("airhockey-replan"), draw_boundary_problems("airhockey-replan", 8, seed=21).boundary
+    old = refine_plans(planner.plan_batch(rows), workers=1).plans
+    left = (1 - part) * old.duration
+    new = planner.replan(old, part * old.duration, goal_q=rows.goal_q, goal_dq=rows.goal_dq)
+    assert (new.duration <= left * (1 + 1e-12)).all()
+    assert evaluate_plans(new, workers=1).valid.all()
+    alone = planner.plan_batch(new.boundary)
+    kept = alone.duration >= 0.98 * left
+    assert kept.any()
+    np.testing.assert_allclose(new.duration[~kept], alone.duration[~kept])
+    states, moments = old.motion.at_times, np.linspace(0, 1, 50) * left[:, None]
+    np.testing.assert_allclose(
+        new.motion.at_times(moments).q[kept], states(moments + part * old.duration[:, None]).q[kept], atol=1e-4
+    )
+
+
+def test_a_goal_that_has_moved_is_planned_by_the_network_alone(planner, rows):
+    old = planned(planner, rows)
+    when = 0.9 * old.duration
+    for shift in (1e-6, 0.1):
+        new = planner.replan(old, when, goal_q=rows.goal_q + shift, goal_dq=rows.goal_dq)
+        np.testing.assert_array_equal(new.path_control_points, planner.plan_batch(new.boundary).path_control_points)
 
 
 def test_replanning_goes_on_without_a_jump_in_position_velocity_or_acceleration(planner, rows):

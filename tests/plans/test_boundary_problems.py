@@ -99,7 +99,7 @@ def test_plans_in_a_file_are_not_looked_at(tmp_path: Path, rows) -> None:
         ({"start_q": np.zeros((3, 7))}, {"problem": "airhockey"}, r"start_q must have shape \(6,\) or \(N, 6\)"),
         ({"start_dq": np.zeros((2, 6))}, {"problem": "airhockey"}, r"start_dq has 2 rows, another .* has 3"),
         ({"goal_q": np.full((3, 6), np.nan)}, {"problem": "airhockey"}, r"goal_q must be finite, got .* in row 0"),
-        ({"goal_q": [["a"] * 6] * 3}, {"problem": "airhockey"}, r"goal_q must be an array of numbers"),
+        ({"goal_q": [["a"] * 6] * 3}, {"problem": "airhockey"}, r"goal_q must hold numbers"),
         ({"sample_id": np.array([0.5] * 3)}, {"problem": "airhockey"}, r"sample_id must hold 3 integers"),
         ({"hit_angle": np.zeros(2)}, {"problem": "airhockey"}, r"hit_angle must have shape \(3,\)"),
     ],

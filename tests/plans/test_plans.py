@@ -37,7 +37,9 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.plans import refine_plans
+from cnpgen.store.files.sealed import under_seal
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
+from tests.examples.plan_files import unsealed
 
 DOCS = Path(__file__).parents[2] / "docs" / "plan-format.md"
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
@@ -292,8 +294,8 @@ def test_another_robot_file_is_another_problem() -> None:
         ({"loss": np.zeros((3, 2, 2))}, r"loss must have shape \(3,\) or \(3, w\)"),
         ({"loss": 0.5}, r"loss must have shape \(3,\)"),
         ({"start_q": np.zeros((3, 6), int)}, "start_q must hold floats, got int64"),
-        ({"start_q": np.zeros((3, 6), complex)}, "start_q must hold floats, got complex128"),
-        ({"start_q": np.full((3, 6), b"x")}, r"start_q must hold floats, got \|S1"),
+        ({"start_q": np.zeros((3, 6), complex)}, "start_q must hold numbers, got complex128"),
+        ({"start_q": np.full((3, 6), b"x")}, r"start_q must hold numbers, got \|S1"),
         ({"sample_id": np.zeros(3)}, "sample_id must hold integers, got float64"),
         ({"sample_id": np.full(3, 2**63, np.uint64)}, r"sample_id must hold integers below 2\^63, got 9223372036854"),
         ({"names": np.array([b"a", b"b", b"c"])}, "names must hold numbers"),
@@ -304,7 +306,7 @@ def test_another_robot_file_is_another_problem() -> None:
         ({"attributes": {"problem": "no/problem.toml"}}, "no such file: .*problem.toml"),
         ({"attributes": {"problem": 3}}, "attribute 'problem' must be a text, got"),
         ({"attributes": {"degree": 7.5}}, "attribute 'degree' must be an integer, got"),
-        ({"attributes": {"degree": 1}}, "degree must be an integer from 3 on, got 1"),
+        ({"attributes": {"degree": 1}}, "degree must be an integer from 3 to 20, got 1"),
         ({"attributes": {"degree": [7, 7]}}, "attribute 'degree' must be an integer"),
         ({"attributes": {"format": "cnpgen-shard"}}, "is a cnpgen-shard file, not one of plans"),
         ({"attributes": {"format_version": 2}}, "format version 2, this cnpgen reads 1: upgrade"),
@@ -329,7 +331,7 @@ def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
 
 def test_a_changed_problem_is_said(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
-    with h5py.File(tmp_path / "plan.h5", "a") as file:
+    with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:
         file.attrs["problem_recipe"] = RECORD.recipe.replace('"velocity_scale": 0.8', '"velocity_scale": 0.9')
     with pytest.raises(DatasetError, match="its problem was changed after it was written"):
         load_plans(tmp_path / "plan.h5")
@@ -368,7 +370,7 @@ def test_the_field_that_does_not_fit_the_others_is_named(
 def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
     with h5py.File(write_minimal(tmp_path / "theirs.h5"), "a") as file:
         file["start_xyz"] = h5py.SoftLink("/nowhere")
-    with pytest.raises(DatasetError, match=r"theirs\.h5 is damaged: its 'start_xyz' cannot be read"):
+    with pytest.raises(DatasetError, match=r"theirs\.h5 is damaged: its 'start_xyz' is a link"):
         load_plans(tmp_path / "theirs.h5")
 
 
@@ -391,7 +393,7 @@ def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:.* puts the tip:RuntimeWarning")
 def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans(columns={"x": np.ones(N)}))
-    content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
+    content, path, draws = unsealed(tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
     for length in [*range(0, len(content), len(content) // 40), len(content) - 1]:
         path.write_bytes(content[:length])
         with pytest.raises(DatasetError, match=r"broken\.h5"):
@@ -411,6 +413,48 @@ def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp
     assert outcomes[False] > 20
 
 
+def test_a_changed_bit_anywhere_in_a_sealed_file_is_noticed(tmp_path: Path) -> None:
+    plans = draw_plans()
+    save_plans(tmp_path / "plan.h5", plans)
+    content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(1)
+    word = len("cnpgen-plans ")
+    for place in [*range(word, 100), *(draws.randrange(word, len(content)) for _ in range(300)), len(content) - 1]:
+        changed = bytearray(content)
+        changed[place] ^= 1 << draws.randrange(8)
+        path.write_bytes(changed)
+        with pytest.raises(DatasetError, match=r"broken\.h5"):
+            load_plans(path)
+    for place in range(word):  # what does not begin as a sealed file does is none, and nothing else has changed
+        path.write_bytes(content[:place] + b"?" + content[place + 1 :])
+        found = load_plans(path)
+        assert not found.sealed
+        assert_equal(found, plans)
+
+
+def test_the_reader_says_whether_a_file_has_a_checksum(tmp_path: Path) -> None:
+    plans = draw_plans()
+    save_plans(tmp_path / "plan.h5", plans)
+    found = load_plans(tmp_path / "plan.h5")
+    assert found.sealed
+    assert found[:2].sealed
+    assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "right"
+    assert not plans.sealed
+    with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:
+        file["loss"] = np.arange(float(N))
+    found = load_plans(tmp_path / "plan.h5")
+    assert not found.sealed
+    assert found.columns["loss"].tolist() == list(range(N))
+    assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "none"
+
+
+def test_a_file_of_a_newer_format_asks_for_an_upgrade(tmp_path: Path) -> None:
+    save_plans(tmp_path / "plan.h5", draw_plans())
+    content = (tmp_path / "plan.h5").read_bytes()
+    (tmp_path / "plan.h5").write_bytes(under_seal(content, kind="cnpgen-plans", version=2))
+    with pytest.raises(DatasetError, match=r"plan\.h5 has format version 2, this cnpgen reads up to 1: upgrade"):
+        load_plans(tmp_path / "plan.h5")
+
+
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
@@ -422,6 +466,7 @@ def garbage() -> Plans:
     rate[4], rate[5, 7], rate[6] = -1.0, -50.0, 0.0
     boundary.goal_dq[7, 0] = np.nan
     rate[8] = 1e-320  # positive, but 1 / r is not a number that can be had
+    rate[4, 7] = -1e308  # finite, but its differences are not
     return make_plans(AIRHOCKEY, boundary, path_control_points=path, rate_control_points=rate)
 
 
@@ -623,7 +668,7 @@ def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(tmp_path
         ({"sample_id": np.full(3, 2**63, np.uint64)}, "sample_id must hold integers from .* to 9223372036854775807"),
         ({"sample_id": ["a", "b", "c"]}, "sample_id must be an array of integers"),
         ({"status": [300, 0, 0]}, "status must hold integers from 0 to 255"),
-        ({"degree": 7.5}, "degree must be an integer from 3 on, got 7.5"),
+        ({"degree": 7.5}, "degree must be an integer from 3 to 20, got 7.5"),
         ({"columns": {".": np.zeros(3)}}, "a column cannot be called '.'"),
     ],
 )

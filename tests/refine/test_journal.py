@@ -1,5 +1,7 @@
 """The journal: whole frames count, damaged or foreign ones are as if they had never been written."""
 
+import hashlib
+import io
 import os
 import sys
 from pathlib import Path
@@ -135,3 +137,17 @@ def test_a_journal_that_appears_while_it_is_opened_is_not_emptied(
         open_journal(path, IDENTITY)
     begun[0].close()
     assert sorted(kept(path)) == [0]
+
+
+@pytest.mark.parametrize("frame", [b"", b"PK\x03\x04", b"no archive", "packed"], ids=["empty", "cut", "text", "packed"])
+def test_a_frame_that_cnpgen_has_not_written_is_no_journal(tmp_path, frame):
+    path = tmp_path / "plans.part"
+    open_journal(path, "{}").close()
+    if frame == "packed":
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, words=np.zeros(10**6, np.uint8))
+        frame = buffer.getvalue()
+    with path.open("ab") as file:
+        file.write(len(frame).to_bytes(8, "little") + hashlib.sha256(frame).digest() + frame)
+    with pytest.raises(UsageError, match=r"plans\.part is no journal that cnpgen has written"):
+        open_journal(path, "{}")

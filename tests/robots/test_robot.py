@@ -204,4 +204,4 @@ def test_file_that_is_no_urdf_is_named(tmp_path, text):
 
 
 def test_missing_urdf_is_named():
-    assert "absent.urdf: not a URDF that Pinocchio can read" in mistake_of(changed(HEAVY, urdf="absent.urdf"))
+    assert "absent.urdf: no such file" in mistake_of(changed(HEAVY, urdf="absent.urdf"))

@@ -5,6 +5,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
+from cnpgen.benchmark.planner import BenchmarkPlanner
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
@@ -148,7 +149,11 @@ def test_name_of_an_unregistered_class_says_where_it_is(register):
 
 
 def test_every_group_has_a_base():
-    assert {group: registry.contract(group) for group in registry.BUILT_IN} == {STAGES: Stage, CONSTRAINTS: Constraint}
+    assert {group: registry.contract(group) for group in registry.BUILT_IN} == {
+        STAGES: Stage,
+        CONSTRAINTS: Constraint,
+        registry.PLANNERS: BenchmarkPlanner,
+    }
     assert registry.CONTRACTS.keys() == registry.BUILT_IN.keys()
 
 

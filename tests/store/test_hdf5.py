@@ -1,50 +1,209 @@
-"""Damaged texts of variable length: an error, where HDF5 itself would never come back."""
+"""The door for HDF5: plain numbers that are in the file itself come through, everything else is refused by name."""
 
+import ast
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
+import cnpgen
 from cnpgen.errors import DatasetError
 from cnpgen.plans import load_plans
-from cnpgen.store.files.hdf5 import check_heaps
+from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.limits import ALWAYS, EXPANSION
+from cnpgen.store.files.sealed import BLOCK, read_sealed, under_seal
+from cnpgen.store.shard import read_placements, read_shard
 from tests.plans.test_plans import write_minimal
 
-
-@pytest.fixture
-def file(tmp_path: Path) -> tuple[Path, int]:
-    """A file as trainers write it, and where its global heap begins."""
-    path = write_minimal(tmp_path / "theirs.h5", attributes={"note": "x" * 300, "other": "y"})
-    return path, path.read_bytes().index(b"GCOL\x01\0\0\0")
+Change = Callable[[Any, Path], None]
+SECRET = "the private key of somebody"
 
 
-def changed(path: Path, at: int, content: bytes) -> None:
-    data = bytearray(path.read_bytes())
-    data[at : at + len(content)] = content
-    path.write_bytes(data)
+def outside(file: Any, folder: Path) -> None:
+    private = folder / "private.txt"
+    private.write_text(SECRET)
+    file.create_dataset("note", shape=(3, 9), dtype="u1", external=[(str(private), 0, 27)])
 
 
-def test_whole_files_are_read(file: tuple[Path, int]) -> None:
-    path, _ = file
-    check_heaps(path)
-    assert len(load_plans(path)) == 3
+def linked_outside(file: Any, folder: Path) -> None:
+    with h5py.File(folder / "other.h5", "w") as other:
+        other["note"] = np.arange(3.0)
+    file["note"] = h5py.ExternalLink(str(folder / "other.h5"), "note")
 
 
-@pytest.mark.parametrize(("offset", "size"), [(9, b"\x20"), (24, b"\x25"), (24, b"\xff" * 8), (8, b"\xff" * 8)])
-def test_a_heap_that_does_not_add_up_is_damage(file: tuple[Path, int], offset: int, size: bytes) -> None:
-    path, begin = file
-    changed(path, begin + offset, size)
-    with pytest.raises(DatasetError, match=rf"theirs\.h5 is damaged: its texts at byte {begin} cannot be read"):
+def linked(file: Any, folder: Path) -> None:
+    file["note"] = h5py.SoftLink("/start_q")
+
+
+def virtual(file: Any, folder: Path) -> None:
+    linked_outside(file, folder)
+    del file["note"]
+    layout = h5py.VirtualLayout(shape=(3,), dtype="f8")
+    layout[:] = h5py.VirtualSource(str(folder / "other.h5"), "note", shape=(3,))
+    file.create_virtual_dataset("note", layout)
+
+
+def references(file: Any, folder: Path) -> None:
+    file.create_dataset("note", data=[file["start_q"].ref] * 3, dtype=h5py.ref_dtype)
+
+
+def ragged(file: Any, folder: Path) -> None:
+    file.create_dataset("note", shape=(3,), dtype=h5py.vlen_dtype(np.float64))
+
+
+def texts(file: Any, folder: Path) -> None:
+    file["note"] = ["a", "b", "c"]
+
+
+def compound(file: Any, folder: Path) -> None:
+    file["note"] = np.zeros(3, [("a", "f8"), ("b", "i4")])
+
+
+def many_dimensions(file: Any, folder: Path) -> None:
+    file["note"] = np.zeros((3, 1, 1, 1, 1))
+
+
+def nothing(file: Any, folder: Path) -> None:
+    file["note"] = h5py.Empty("f8")
+
+
+def never_written(file: Any, folder: Path) -> None:
+    file.create_dataset("note", shape=(10**12,), dtype="f8")
+
+
+def packed(file: Any, folder: Path) -> None:
+    file.create_dataset("note", shape=(3, 10**8), dtype="f8", compression="gzip", chunks=(1, 10**6))
+
+
+def large_chunks(file: Any, folder: Path) -> None:
+    file.create_dataset("note", shape=(3, 1), dtype="f8", chunks=(3, 10**7), maxshape=(3, None))
+
+
+def scaled(file: Any, folder: Path) -> None:
+    file.create_dataset("note", data=np.arange(3), chunks=(3,), scaleoffset=4)
+
+
+REFUSED: dict[str, tuple[Change, str]] = {
+    "storage in another file": (outside, "the numbers of note are in another file"),
+    "a virtual dataset": (virtual, "the numbers of note are in another file"),
+    "a link to another file": (linked_outside, "its 'note' is a link"),
+    "a link within the file": (linked, "its 'note' is a link"),
+    "references to objects": (references, "note must hold numbers, got object"),
+    "lists of variable length": (ragged, "note must hold numbers, got object"),
+    "texts": (texts, "note must hold numbers, got object"),
+    "tables": (compound, "note must hold numbers, got"),
+    "too many dimensions": (many_dimensions, "note must have at most 4 dimensions"),
+    "no space": (nothing, "note must have at most 4 dimensions, got None"),
+    "numbers that nobody has written": (never_written, r"note declares the shape \(1000000000000,\)"),
+    "much out of little": (packed, "note declares the shape .* more than 100 times as many"),
+    "chunks that are larger than what they hold": (large_chunks, "note declares the shape"),
+    "another filter": (scaled, r"note is packed with filter \[6\], expected gzip, shuffle"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_not_plainly_in_the_file_is_refused_by_name(tmp_path: Path, what: str) -> None:
+    change, message = REFUSED[what]
+    path = write_minimal(tmp_path / "theirs.h5")
+    with h5py.File(path, "a") as file:
+        change(file, tmp_path)
+    for read in (load_plans, read_shard, read_placements):
+        with pytest.raises(DatasetError, match=rf"theirs\.h5.*{message}"):
+            read(path)
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_so_it_is_under_a_seal(tmp_path: Path, what: str) -> None:
+    change, message = REFUSED[what]
+    path = tmp_path / "model.h5"
+    with h5py.File(path, "w", userblock_size=BLOCK) as file:
+        file["start_q"] = np.zeros((3, 6))
+        change(file, tmp_path)
+    path.write_bytes(under_seal(path.read_bytes(), kind="cnpgen-model", version=1))
+    with pytest.raises(DatasetError, match=rf"model\.h5.*{message}"):
+        read_sealed(path, kind="cnpgen-model", version=1)
+
+
+def test_what_is_not_asked_for_does_not_matter(tmp_path: Path) -> None:
+    path = write_minimal(tmp_path / "theirs.h5")
+    with h5py.File(path, "a") as file:
+        outside(file, tmp_path)
+        file["group/inside"] = h5py.SoftLink("/nowhere")
+    with opened_hdf5(path) as file:
+        assert "note" in file
+        assert file["start_q"].read().shape == (3, 6)
+        assert "group" not in set(file)
+        with pytest.raises(DatasetError, match="group must be a dataset, got a group"):
+            file["group"]
+
+
+@pytest.mark.parametrize(
+    "how", [{"compression": "gzip"}, {"compression": "lzf"}, {"shuffle": True, "fletcher32": True}, {"chunks": (1, 2)}]
+)
+def test_packed_numbers_are_read(tmp_path: Path, how: dict[str, Any]) -> None:
+    path = write_minimal(tmp_path / "theirs.h5")
+    values = np.arange(12.0).reshape(3, 4)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("note", data=values, **how)
+    assert load_plans(path).columns["note"].tolist() == values.tolist()
+
+
+def test_datasets_are_counted_together(tmp_path: Path) -> None:
+    path = tmp_path / "many.h5"
+    each = ALWAYS // 8 // 4 + 1
+    with h5py.File(path, "w") as file:
+        for index in range(4):
+            file.create_dataset(f"note{index}", shape=(each,), dtype="f8")
+    assert EXPANSION * path.stat().st_size < ALWAYS
+    with opened_hdf5(path) as file:
+        assert len({name: file[name] for name in ("note0", "note1", "note2")}) == 3
+        with pytest.raises(DatasetError, match="note3 declares"):
+            file["note3"]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [["a", "b"], h5py.Empty("f8"), np.zeros(2, [("a", "f8")]), np.array([True])],
+    ids=["texts", "nothing", "a table", "yes or no"],
+)
+def test_an_attribute_is_a_text_or_numbers(tmp_path: Path, value: Any) -> None:
+    path = write_minimal(tmp_path / "theirs.h5")
+    with h5py.File(path, "a") as file:
+        file.attrs["degree"] = value
+    with pytest.raises(DatasetError, match="the attribute 'degree' must be a text, a number or a list of numbers"):
         load_plans(path)
 
 
-def test_numbers_that_look_like_a_heap_are_numbers(tmp_path: Path) -> None:
-    """The signature alone may occur in control points; with a version after it, it is no number that anybody has."""
-    values = np.frombuffer(b"GCOL" + b"\x01\x00\x00\x40", "<f8")
-    path = write_minimal(tmp_path / "numbers.h5", loss=np.repeat(values, 3))
-    assert load_plans(path).columns["loss"][0] == values[0]
+def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
+    path = write_minimal(tmp_path / "theirs.h5")
+    with h5py.File(path, "a") as file:
+        h5py.h5d.create(file.id, b"\xff", h5py.h5t.NATIVE_DOUBLE, h5py.h5s.create_simple((3,)))
+    with pytest.raises(DatasetError, match="which is not UTF-8"):
+        load_plans(path)
 
 
-def test_an_empty_file_is_left_to_hdf5(tmp_path: Path) -> None:
-    (tmp_path / "empty.h5").touch()
-    check_heaps(tmp_path / "empty.h5")
+def test_a_device_is_not_a_file() -> None:
+    with pytest.raises(DatasetError, match="/dev/zero is not a file"), opened_hdf5(Path("/dev/zero")):
+        pass
+
+
+def test_nothing_else_in_the_package_opens_hdf5() -> None:
+    """Files are made in memory by what ``create_hdf5`` returns; only the door reads."""
+    package = Path(cnpgen.__file__).parent
+    opened = []
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and node.attr == "File" and ast.unparse(node.value) == "h5py":
+                opened.append((path.relative_to(package).as_posix(), node.lineno))
+            if isinstance(node, ast.Attribute) and ast.unparse(node) in {"h5f.open", "h5py.h5f.open"}:
+                opened.append((path.relative_to(package).as_posix(), node.lineno))
+            if isinstance(node, ast.ImportFrom) and node.module == "h5py":
+                assert not {alias.name for alias in node.names} & {"File", "h5f"} or path.name == "hdf5.py"
+    makers = {"store/files/sealed.py", "store/shard.py", "plans/save.py"}
+    assert {name for name, _ in opened} == makers | {"store/files/hdf5.py"}
+    for name, line in opened:
+        text = (package / name).read_text(encoding="utf-8").splitlines()[line - 1]
+        assert name == "store/files/hdf5.py" or "h5py.File(create_hdf5(" in text

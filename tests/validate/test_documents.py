@@ -38,7 +38,7 @@ def test_a_blueprint_without_a_recipe_is_a_finding(damaged, recipe):
 def test_statistics_must_sum_up_the_records_of_the_shards(damaged):
     blueprint = load_blueprint(damaged)
     assert check_statistics(damaged, blueprint) == []
-    document = load_document(damaged / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION)
+    document = load_document(damaged / STATS, STATS_FORMAT, version=STATS_FORMAT_VERSION, form={})
     document["splits"]["train"]["start_q"]["mean"][0] += 1e-9
     save_document(damaged / STATS, document)
     (finding,) = check_statistics(damaged, blueprint)

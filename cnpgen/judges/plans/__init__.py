@@ -1,4 +1,4 @@
-"""The verdict: plans checked with Pinocchio and Coal on a fine time grid, and what is counted and shown of it."""
+"""The verdict: plans checked with Pinocchio and Coal at every moment, and what is counted and shown of it."""
 
 from cnpgen.judges.plans.judge import judge
 from cnpgen.judges.plans.summary import summarise

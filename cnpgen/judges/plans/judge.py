@@ -1,23 +1,27 @@
-"""Check plans with Pinocchio and Coal on a fine time grid.
+"""Check plans with Pinocchio and Coal, on a fine time grid and between its moments.
 
 With what optimised them it shares the problem, with its bounds, tolerances and where its obstacles stand, and what
 control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or distances, and no transcription.
 """
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.judges.plans.closer import keep_worse, look_closer
+from cnpgen.judges.plans.between import polynomials
+from cnpgen.judges.plans.closer import look_closer
 from cnpgen.judges.plans.course import course, jerks
-from cnpgen.judges.plans.measure import boundary_margins, by_name, constraint_margins
+from cnpgen.judges.plans.limits import is_proven, limit_margin
+from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
+from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
+from cnpgen.judges.plans.peaks import look_at_peaks
 from cnpgen.judges.plans.sampling import Samples, sample, time_table
+from cnpgen.judges.plans.survey import Survey, survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
-from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -43,11 +47,12 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
 ) -> list[Verdict]:
     """Judge N plans, each for itself: what one of them holds changes nothing about the others.
 
-    Every constraint's ``measured`` form is evaluated with Pinocchio and Coal at moments no further than ``step`` apart
-    and at more of them near both ends (``cnpgen.judges.plans.sampling``). A plan is valid if it meets its boundary
-    conditions and exceeds every bound by no more than the constraint allows. Numbers that cannot be evaluated give a
-    verdict that says so, no exception. What lies between two samples is not seen; only contacts, whose depth has sharp
-    peaks, are looked at more closely wherever more than is allowed could hide (``cnpgen.judges.plans.closer``).
+    A plan is valid if it meets its boundary conditions and exceeds every bound by no more than the constraint allows,
+    at every moment. Limits of joint positions, velocities and accelerations are proven to hold between any two moments
+    (``cnpgen.judges.plans.between``). Every other constraint's ``measured`` form is evaluated with Pinocchio and Coal
+    at moments no further than ``step`` apart and at more of them near both ends (``sampling``); then around every
+    maximum that could decide, until nothing is left to gain (``peaks``), and between moments where contacts could hide
+    more than is allowed (``closer``). Numbers that cannot be evaluated give a verdict that says so, no exception.
 
     Args:
         problem: The problem.
@@ -160,23 +165,34 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
 
 def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
-    samples = _samples(plan, step)
-    if isinstance(samples, Verdict):
-        return samples
+    found = _samples(plan, step)
+    if isinstance(found, Verdict):
+        return found
+    samples, table = found
     states = course(plan.motion, samples.s)
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
-    margins = [
-        *boundary_margins(states, plan.boundary, samples, world.robot.joint_names),
-        *constraint_margins(plan.problem, world, samples),
-    ]
+    ends = boundary_margins(states, plan.boundary, samples, world.robot.joint_names)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
-        metrics = _metrics(plan, world, samples)
+        metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
-    margins = keep_worse(margins, look_closer(plan.problem, world, plan.motion, samples, plan.tops))
-    return Verdict(_reason(margins), by_name(margins), metrics, paper, len(samples.s))
+    margins = [*ends, *_margins(survey(plan.problem, plan.motion, plan.tops, world, samples, table))]
+    return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
+
+
+def _margins(survey: Survey) -> list[Margin]:
+    """Measure every constraint, at the samples and between them; the survey's world is moved."""
+    worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
+    for each, margin in chain(look_closer(survey), look_at_peaks(survey)):
+        worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
+    pieces, margins = polynomials(survey.motion), []
+    for constraint in survey.problem.constraint:
+        if is_proven(constraint):
+            margins.append(limit_margin(constraint, survey.world, pieces, survey.table))
+        margins += [worst[id(each)] for each in survey.measured if each.constraint is constraint]
+    return margins
 
 
 def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
@@ -188,13 +204,15 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.tops)
-    if not all(margin.ok for margin in constraint_margins(plan.problem, world, samples)):
+    start_tip = world.tip_position[:, 0]
+    found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
+    if not all((each.share <= 1).all() for each in found):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
 
 
-def _samples(plan: _Plan, step: float) -> Samples | Verdict:
-    """Choose where to look, or say why there is nothing to look at."""
+def _samples(plan: _Plan, step: float) -> tuple[Samples, Array] | Verdict:
+    """Choose where to look, and tell the times of ``table_phases()`` [s], or say why there is nothing to look at."""
     if not plan.is_finite():
         return Verdict(Reason.NOT_FINITE)
     if not plan.motion.runs_forward()[0]:
@@ -202,35 +220,16 @@ def _samples(plan: _Plan, step: float) -> Samples | Verdict:
     rate, degree = plan.motion.rate[0], plan.motion.degree
     table = time_table(rate, degree)
     spans = max(plan.motion.path.shape[1], len(rate)) - degree
-    return sample(table, step, spans) or Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
+    kinks = {s for constraint in plan.problem.constraint for s in constraint.kinks}
+    samples = sample(table, step, spans, kinks)
+    return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
 
 
-def _reason(margins: list[Margin]) -> str:
-    """Why a plan is not valid: its boundary conditions first, then the constraint that is broken worst."""
+def reason_of(margins: list[Margin]) -> str:
+    """Say why a plan is not valid: its boundary conditions first, then the constraint that is broken worst."""
     broken = [margin for margin in margins if not margin.ok]
     if not broken:
         return Reason.OK
     if any(margin.reason == Reason.BOUNDARY for margin in broken):
         return Reason.BOUNDARY
     return max(broken, key=lambda margin: margin.severity).reason
-
-
-def _metrics(plan: _Plan, world: PathWorld, samples: Samples) -> Metrics:
-    problem, robot = plan.problem, world.robot
-    jerk = jerks(plan.motion, samples.s)
-    share = world.torque / robot.torque_limit[:, None]
-    table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
-    upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
-    return Metrics(
-        duration=float(samples.t[-1]),
-        effort=samples.integral(np.sum(share**2, axis=0)),
-        jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
-        hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
-        z_error=np.nan if table is None else samples.integral(np.abs(world.tip_position[2] - table.z)),
-        vertical_error=samples.integral(_tilt(world.tip_rotation)) if upright else np.nan,
-    )
-
-
-def _tilt(R: Array) -> Array:
-    """|roll| + |pitch| of rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` [rad], shape (3, 3, K) -> (K,)."""
-    return np.asarray(np.abs(np.arctan2(R[2, 1], R[2, 2])) + np.abs(np.arctan2(R[2, 0], np.hypot(R[2, 1], R[2, 2]))))

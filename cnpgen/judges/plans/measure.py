@@ -4,7 +4,8 @@ A margin is measured of each, where the motion comes closest to the bound or is 
 axis or obstacle.
 """
 
-from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -16,8 +17,6 @@ from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
-from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
@@ -71,61 +70,72 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joint
     return margins
 
 
-def constraint_margins(problem: Problem, world: PathWorld, samples: Samples) -> Iterator[Margin]:
-    """Measure every constraint along a motion, one by one.
+@dataclass(frozen=True)
+class Measured:
+    """A condition along a motion.
 
-    Args:
-        problem: The problem.
-        world: Its robot at the samples.
-        samples: When and at which phase they are.
+    Attributes:
+        constraint: The constraint that states it.
+        condition: What the constraint measured at K samples.
+        g: The m values [unit of the condition], shape (m, K).
+        wider: How much wider than its bounds it is [unit of the condition], shape (K,).
+        allowed: How far beyond them a motion may be and still be called valid, shape (m,).
     """
-    start_tip = world.tip_position[:, 0]
-    for constraint in problem.constraint:
-        for condition in constraint.measured(cast("World", world)):  # the same questions, answered for K states
-            if condition.g:
-                yield measure_condition(problem, constraint, condition, samples, start_tip=start_tip)
+
+    constraint: Constraint
+    condition: Condition
+    g: Array
+    wider: Array
+    allowed: Array
+
+    @cached_property
+    def excess(self) -> Array:
+        """How far the values are beyond their bounds, shape (m, K)."""
+        below, above = self.condition.lower[:, None] - self.g, self.g - self.condition.upper[:, None]
+        return np.asarray(np.maximum(below, above) - self.wider)
+
+    @cached_property
+    def share(self) -> Array:
+        """The excess in multiples of what is allowed, shape (m, K)."""
+        return np.asarray(self.excess / np.maximum(self.allowed, NOTHING)[:, None])
+
+    def margin(self, problem: Problem, samples: Samples) -> Margin:
+        """Say where the motion comes closest to breaking the condition, or breaks it most."""
+        part, k = divmod(int(np.argmax(self.share)), len(samples.s))  # argmax finds the first that is nan, if any is
+        low, high, g = self.condition.lower[part], self.condition.upper[part], self.g[part, k]
+        worst = float(self.excess[part, k])
+        return Margin(
+            self.condition.name,
+            self.constraint.reason,
+            self.condition.unit,
+            name_part(problem, self.constraint, self.condition, part),
+            value=float(g),
+            bound=float(low - self.wider[k] if low - g > g - high else high + self.wider[k]),
+            excess=np.inf if np.isnan(worst) else worst,
+            allowed=float(self.allowed[part]),
+            time=float(samples.t[k]),
+            phase=float(samples.s[k]),
+        )
 
 
-def measure_condition(
-    problem: Problem,
-    constraint: Constraint,
-    condition: Condition,
-    samples: Samples,
-    *,
-    start_tip: Array,
-) -> Margin:
-    """Find where a motion comes closest to breaking a condition, or breaks it most.
+def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array) -> list[Measured]:
+    """Measure the conditions of a constraint along a motion.
 
     Args:
-        problem: The problem.
-        constraint: One of its constraints.
-        condition: What the constraint measured at the samples.
-        samples: When and at which phase they are.
+        constraint: The constraint.
+        world: The robot at phases s.
+        s: Phases, shape (K,).
         start_tip: Where the tip is at the start of the motion [m], shape (3,).
     """
-    g = np.empty((len(condition.g), len(samples.s)))
-    for row, value in zip(g, condition.g, strict=True):
-        row[:] = value
-    wider = constraint.funnel(condition, samples.s, start_tip)
-    below, above = condition.lower[:, None] - g, g - condition.upper[:, None]
-    excess = np.maximum(below, above) - wider
-    allowed = constraint.allowed(condition)
-    share = excess / np.maximum(allowed, NOTHING)[:, None]  # argmax finds the first that is nan, if any is
-    part, k = divmod(int(np.argmax(share)), len(samples.s))
-    is_low = below[part, k] > above[part, k]
-    worst = float(excess[part, k])
-    return Margin(
-        condition.name,
-        constraint.reason,
-        condition.unit,
-        name_part(problem, constraint, condition, part),
-        value=float(g[part, k]),
-        bound=float(condition.lower[part] - wider[k] if is_low else condition.upper[part] + wider[k]),
-        excess=np.inf if np.isnan(worst) else worst,
-        allowed=float(allowed[part]),
-        time=float(samples.t[k]),
-        phase=float(samples.s[k]),
-    )
+    found = []
+    for condition in constraint.measured(cast("World", world)):  # the same questions, answered for K states
+        if condition.g:
+            g = np.empty((len(condition.g), len(s)))
+            for row, value in zip(g, condition.g, strict=True):
+                row[:] = value
+            wider = constraint.funnel(condition, s, start_tip)
+            found.append(Measured(constraint, condition, g, wider, constraint.allowed(condition)))
+    return found
 
 
 def by_name(margins: list[Margin]) -> dict[str, Margin]:
@@ -150,8 +160,8 @@ def name_part(problem: Problem, constraint: Constraint, condition: Condition, pa
         return ""
     if isinstance(constraint, _PER_JOINT):
         return problem.robot.joints[part]
-    if isinstance(constraint, Table | Vertical):
-        return "xy"[part]
+    if condition.parts:
+        return condition.parts[part]
     obstacles = [obstacle.name for obstacle in problem.obstacle]
     if isinstance(constraint, ObjectContact):
         return obstacles[part]

@@ -1,5 +1,6 @@
 """Where a motion is looked at: a time step apart, in every span of its splines, and densely near both ends."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,7 +15,7 @@ FEWEST = 200  # samples of a motion
 LONGEST = 200_000  # time steps that a motion may take: three minutes at 1 ms, which take a second to look at
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
 CELLS = 4096  # of equal size in the table of times
-PER_SPAN = 4  # samples between two knots, evenly in phase
+PER_SPAN = 8  # samples between two knots, evenly in phase
 AT_ENDS = 64  # additional samples at each end
 END = 0.05  # how far from each end they reach, in phase
 
@@ -58,7 +59,7 @@ def table_phases() -> Array:
     return np.unique(np.concatenate([np.linspace(0, 1, CELLS + 1), near, 1 - near]))
 
 
-def sample(table: Array, step: float, spans: int) -> Samples | None:
+def sample(table: Array, step: float, spans: int, also: Collection[float] = ()) -> Samples | None:
     """Choose samples that are at most ``step`` apart and see everything that a B-spline can do.
 
     * Times, at least ``FEWEST``, no more than ``step`` apart.
@@ -70,6 +71,7 @@ def sample(table: Array, step: float, spans: int) -> Samples | None:
         table: What ``time_table`` returned.
         step: Time step [s].
         spans: Number of intervals between the knots of the finer spline.
+        also: Further phases.
 
     Returns:
         The samples, or None if the motion takes longer than ``LONGEST`` steps.
@@ -81,7 +83,7 @@ def sample(table: Array, step: float, spans: int) -> Samples | None:
     phases = table_phases()
     by_time = np.interp(np.linspace(0, duration, count), table, phases)
     near = END * (np.arange(AT_ENDS + 1) / AT_ENDS) ** 2
-    s = np.unique(np.concatenate([by_time, np.linspace(0, 1, PER_SPAN * spans + 1), near, 1 - near]))
+    s = np.unique(np.concatenate([by_time, np.linspace(0, 1, PER_SPAN * spans + 1), near, 1 - near, list(also)]))
     return Samples(s, np.interp(s, phases, table))
 
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from cnpgen.errors import DatasetError
 from cnpgen.judges.rows.diagnostics import ALLOWED, Diagnostic, stored_diagnostics
 from cnpgen.judges.rows.fastest_hit import highest_speed
+from cnpgen.judges.rows.hits import HitRule, judge_goals
 from cnpgen.judges.rows.report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition
 from cnpgen.problems.constraints.needs import measured_needs
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
+NO_RULE = HitRule()
 BLOCK = 1024  # rows: what is collected of a block before it is judged stays below 10 MB
 
 _REQUIRED = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
@@ -32,7 +34,11 @@ Key = tuple[str, str, str]  # name, unit and exactness of a condition
 
 
 def verify_rows(
-    problem: "Problem", robot: "Robot", columns: Mapping[str, ArrayLike], dtype: str = "float64"
+    problem: "Problem",
+    robot: "Robot",
+    columns: Mapping[str, ArrayLike],
+    dtype: str = "float64",
+    rule: HitRule = NO_RULE,
 ) -> RowReport:
     """Verify rows with Pinocchio and Coal.
 
@@ -47,7 +53,9 @@ def verify_rows(
       rows have ``hit_angle`` and ``hit_speed``;
     * "highest hit speed": ``hit_speed_max`` is the optimum of the linear programme that it is defined by;
     * "holding torque ratio" and "clearance": what the rows store of an end as ``start_torque_ratio``,
-      ``goal_torque_ratio``, ``start_clearance`` and ``goal_clearance`` is what is computed there.
+      ``goal_torque_ratio``, ``start_clearance`` and ``goal_clearance`` is what is computed there;
+    * "hitting configuration" and "hitting velocity", if ``rule`` says how goals came about: see
+      ``cnpgen.judges.rows.hits``.
 
     How exactly each must hold is ``cnpgen.problems.constraints.constraint.EXACTNESS``.
 
@@ -58,6 +66,7 @@ def verify_rows(
             ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``,
             ``hit_speed_max`` and diagnostics. Other fields must be finite.
         dtype: The float type that the rows are stored in, which decides how exact they must be.
+        rule: What the stages that drew the rows say of their goals; nothing by default.
 
     Raises:
         DatasetError: A field is missing or has another shape.
@@ -68,7 +77,7 @@ def verify_rows(
     slices = [slice(first, first + BLOCK) for first in range(0, max(rows, 1), BLOCK)]
     blocks = ({name: column[part] for name, column in values.items()} for part in slices)
     with np.errstate(over="ignore", invalid="ignore"):  # what is too large to compute with becomes inf or nan: it fails
-        return merge([_verify_block(problem, world, block, dtype) for block in blocks])
+        return merge([_verify_block(problem, world, block, dtype, rule) for block in blocks])
 
 
 def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
@@ -124,7 +133,7 @@ class _Block:
     conditions: dict[Key, _Values] = field(default_factory=dict)
 
 
-def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], dtype: str) -> RowReport:
+def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], dtype: str, rule: HitRule) -> RowReport:
     rows = len(columns["start_q"])
     n_bad = np.sum([np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0)
     finite = np.flatnonzero(n_bad == 0)
@@ -138,6 +147,7 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
         *(values.judged(key, dtype) for key, values in block.conditions.items()),
         *_judge_hit(block, columns, finite, dtype),
         *_judge_highest(world.robot, block, columns, finite, dtype),
+        *judge_goals(world.robot, rule, columns, finite, dtype),
         *(diagnostic.judged(finite, dtype) for diagnostic in block.diagnostics),
     ]
     out = np.unique(np.concatenate([rows_out for _, rows_out in judged]))

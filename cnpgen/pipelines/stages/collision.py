@@ -120,7 +120,7 @@ def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) ->
     moving = _add_capsules(geometry, robot, radius)
     if problem.object is not None:
         size = np.array(problem.object.size) - 2 * depth
-        frame = model.frames[model.getFrameId(robot.tip)]
+        frame = model.frames[robot.tip_frame]
         box = pin.GeometryObject("object", frame.parentJoint, 0, frame.placement, coal.Box(*size))
         moving.append(geometry.addGeometryObject(box))
     for index, obstacle in enumerate(problem.obstacle):
@@ -152,7 +152,7 @@ def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
     origins = [data.oMi[i].translation.copy() for i in range(1, model.njoints)]
-    origins.append(data.oMf[model.getFrameId(robot.tip)].translation.copy())
+    origins.append(data.oMf[robot.tip_frame].translation.copy())
     added = []
     for a, b in robot.skeleton:
         joint = b  # the body that carries origin b; the joints between a and b lie on the segment's line

@@ -32,7 +32,8 @@ class HitAngleToGoal(Stage):
     def describe(self) -> str:
         """Say where to."""
         x, y = self.target
-        return f"aim from the goal position at ({x:g}, {y:g}) m, plus uniform noise of +-{self.noise:g} rad"
+        noise = f", plus uniform noise of +-{self.noise:g} rad" if self.noise else ""
+        return f"aim from the goal position at ({x:g}, {y:g}) m{noise}"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The angle."""

@@ -204,7 +204,7 @@ def basic_joints(robot: "Robot") -> tuple[int, int, int]:
 
     random = np.random.default_rng(0)
     low, high = np.maximum(robot.base - 0.7, robot.position_lower), np.minimum(robot.base + 0.7, robot.position_upper)
-    data, tip = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    data, tip = robot.model.createData(), robot.tip_frame
     frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     jacobians = np.array(
         [pin.computeFrameJacobian(robot.model, data, random.uniform(low, high), tip, frame)[:3] for _ in range(64)]

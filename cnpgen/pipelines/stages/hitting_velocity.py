@@ -10,14 +10,16 @@ face. The joints left are then given the velocity ``v_i = t L_i sign(b_i . z)`` 
 equations: again a linear programme, whose dual has its optimum at a ``z`` orthogonal to one of the b_i.
 """
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.errors import UsageError
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Round, Stage, Work
+from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, dot
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 VANISHING = 1e-11  # m: a residual below this is zero
+SHARE = "hit_speed_share"  # the column in which tasks say how fast, as a fraction of the highest possible speed
 PARALLEL = 1e-9  # relative size of a determinant that is taken for zero
 
 
@@ -63,13 +66,44 @@ class HittingVelocity(Stage):
 
     def prepare(self, context: Context) -> Work:
         """Load the kernel."""
+
+        def draw_share(draws: Round, random: np.random.Generator, _speed: Array) -> Array:
+            factor, choice = draws.draw(random, 1), draws.draw(random, 1)
+            return np.where(choice < self.full_speed, 1.0, factor)
+
+        return self._solve(context, draw_share)
+
+    def takes(self, context: Context) -> tuple[Field, ...]:
+        """How fast: the speed, or its share of the highest possible one, which is 1 where neither is given."""
+        share = Field(SHARE, "1", "speed of the hit, as a fraction of the highest possible one", role="context")
+        return self.provides(context)[1], share
+
+    def complete(self, context: Context, given: Collection[str]) -> Work:
+        """Load the kernel, for the speed that is given."""
+        if {"hit_speed", SHARE} <= set(given):
+            raise UsageError(f"hit_speed and {SHARE} both say how fast the hit is: give one of them")
+
+        def given_share(draws: Round, _random: np.random.Generator, speed: Array) -> Array:
+            if SHARE in given:
+                return draws[SHARE]
+            return draws["hit_speed"] / speed if "hit_speed" in given else np.ones_like(speed)
+
+        solve = self._solve(context, given_share)
+
+        def work(draws: Round, random: np.random.Generator) -> None:
+            solve(draws, random)
+            possible = (draws["hit_speed"] > 0) & (draws["hit_speed"] <= draws["hit_speed_max"])
+            draws.reject(possible[0], "hit speed not between 0 and the highest possible one")
+
+        return work
+
+    def _solve(self, context: Context, share: Callable[[Round, np.random.Generator, Array], Array]) -> Work:
         kernel = context.kernels.load(hitting_velocity)
 
         def work(draws: Round, random: np.random.Generator) -> None:
             direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
             velocity, speed = kernel(draws["goal_q"], direction)
-            factor, choice = draws.draw(random, 1), draws.draw(random, 1)
-            factor = np.where(choice < self.full_speed, 1.0, factor)
+            factor = share(draws, random, speed)
             draws["goal_dq"], draws["hit_speed"], draws["hit_speed_max"] = velocity * factor, speed * factor, speed
             solved = np.isfinite(velocity).all(0) & np.isfinite(speed[0])  # not where the Jacobian is singular
             draws.reject(solved & (speed[0] >= self.min_speed), "no hitting velocity")

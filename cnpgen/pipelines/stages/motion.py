@@ -1,5 +1,6 @@
 """Stages: velocity and acceleration of the start, at rest or random and exactly on the table manifold."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ from cnpgen.symbolic.state import Vec, bias_acceleration, forward_kinematics, in
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
+
+STILL = 1e-9  # rad/s and rad/s^2: what rounding leaves of a velocity or an acceleration that was zero
 
 
 def _motion_fields(context: Context, end: str) -> tuple[Field, Field]:
@@ -55,6 +58,17 @@ class AtRest(Stage):
 
         return work
 
+    def complete(self, context: Context, given: Collection[str]) -> Work:
+        """Reject tasks that are said to move."""
+        rest, names = self.prepare(context), [name for name in self.writes(context) if name in given]
+
+        def work(draws: Round, random: np.random.Generator) -> None:
+            for name in names:
+                draws.reject((np.abs(draws[name]) <= STILL).all(0), f"not at rest at the {self.end}")
+            rest(draws, random)
+
+        return work
+
 
 @dataclass(frozen=True, kw_only=True)
 class TableVelocity(Stage):
@@ -89,6 +103,17 @@ class TableVelocity(Stage):
             length[choice < self.at_rest] = 0.0
             draws["start_dq"], draws["start_tip_velocity"] = kernel(draws["start_q"], direction, length)
             draws.reject(np.isfinite(draws["start_dq"]).all(0), "no velocity on the manifold")
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> Work:
+        """Load what tells how the tip moves; a start of which no velocity is given is at rest."""
+        kernel, n = context.kernels.load(velocity_of_tip), context.robot.n
+
+        def work(draws: Round, _random: np.random.Generator) -> None:
+            if "start_dq" not in given:
+                draws["start_dq"] = np.zeros((n, len(draws.alive)))
+            (draws["start_tip_velocity"],) = kernel(draws["start_q"], draws["start_dq"])
 
         return work
 
@@ -127,6 +152,15 @@ class TableAcceleration(Stage):
             draws.reject(room[0] >= 0, f"no acceleration within the limits at the {self.end}")
 
         return work
+
+
+def velocity_of_tip(robot: "Robot") -> Any:
+    """Build ``(q, dq) -> velocity of the tip`` [m/s]."""
+    import casadi as ca
+
+    (q_sx, q), (dq_sx, dq) = symbols("q", robot.n), symbols("dq", robot.n)
+    velocity = tip_velocity(forward_kinematics(robot.chain, q), dq)
+    return ca.Function("velocity_of_tip", [q_sx, dq_sx], [ca.vertcat(*velocity)])
 
 
 def table_velocity(robot: "Robot") -> Any:

@@ -1,13 +1,14 @@
 """The contract of a stage, and the round of draws that stages work on."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
@@ -30,10 +31,11 @@ class Round:
         stage: Label of the stage that works on the round now.
         origins: Reason -> label of the stage that first gave it.
         drawn: Name -> values of all draws, shape (width, N), for columns written before any rejection.
+        last: Whether no draws can follow, so that all of this round count.
     """
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    def __init__(self, size: int, *, last: bool = False) -> None:
+        self.size, self.last = size, last
         self.alive = np.arange(size)
         self.fate = np.zeros(size, np.uint16)
         self.reasons: list[str] = []
@@ -88,6 +90,11 @@ class Stage(ABC):
     block_rows: ClassVar[int] = BLOCK_ROWS
 
     @property
+    def tasks(self) -> int | None:
+        """How many draws there are at all, where they are listed and each is made once; None where they never end."""
+        return None
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """Columns that earlier stages must have written; those that depend on no key can be an attribute of a class."""
         return ()
@@ -115,3 +122,47 @@ class Stage(ABC):
             A function of (draws, random) that writes columns of a round and rejects draws of it. It must use
             ``draws.draw`` for randomness.
         """
+
+    def takes(self, context: "Context") -> tuple[Field, ...]:
+        """List the fields that tasks may give instead; by default all that it provides but diagnostics."""
+        return tuple(field for field in self.provides(context) if field.role != "diagnostic")
+
+    def complete(self, context: "Context", given: Collection[str]) -> Work:
+        """Prepare the stage for tasks whose columns are partly given: what is given stays, what is not is found.
+
+        By default a stage has nothing to do where all that it takes is given, and does its own work where nothing is.
+        What it draws is then always the middle of what it could be (see ``Tasks``).
+
+        Args:
+            context: As of ``prepare``.
+            given: Names of the columns that are known of every task.
+
+        Raises:
+            UsageError: Columns that belong together are given in part.
+        """
+        names = [field.name for field in self.takes(context)]
+        known, missing = [name for name in names if name in given], [name for name in names if name not in given]
+        if known and missing:
+            raise UsageError(f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}")
+        return leave if known else self.prepare(context)
+
+
+def leave(draws: Round, random: np.random.Generator) -> None:
+    """Do nothing: what the stage would find is given."""
+
+
+class Tasks(Round):
+    """Tasks in the place of draws: nothing of them is random.
+
+    What a stage still draws, since it is not given, is the middle of all that it could be, for every task: no noise.
+    What comes of one task so depends on no other.
+    """
+
+    def draw(self, random: np.random.Generator, width: int) -> Array:
+        """Return 0.5 for every survivor, shape (width, n)."""
+        del random
+        return np.full((width, len(self.alive)), 0.5)
+
+    def why(self) -> tuple[str, ...]:
+        """Return why each of the N tasks has no answer; empty where it has one."""
+        return tuple(("", *self.reasons)[fate] for fate in self.fate.tolist())

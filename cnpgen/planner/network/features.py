@@ -67,6 +67,12 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     return np.concatenate([_block(tasks, name) for name in blocks], axis=1, dtype=np.float64)
 
 
+def count_features(blocks: tuple[str, ...], joints: int) -> int:
+    """Return how many features some of ``BLOCKS`` have, for a robot of so many planned joints."""
+    widths = {**dict.fromkeys(STATES, joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
+    return sum(widths[name] for name in blocks)
+
+
 def _block(tasks: Tasks, name: str) -> Array:
     boundary = tasks.boundary
     if name in STATES:

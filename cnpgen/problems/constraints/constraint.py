@@ -48,6 +48,7 @@ class Condition:
         lower: Lower bounds, shape (m,), -inf where there is none.
         upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
         exactness: Key of ``EXACTNESS``: how exactly a boundary state must meet it.
+        parts: Names of the values, m of them, or none: they are numbered then.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Condition:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     exactness: str
+    parts: tuple[str, ...] = ()
 
     @property
     def is_equality(self) -> bool:
@@ -91,12 +93,14 @@ class Constraint(ABC):
 
     Attributes:
         reason: The name under which a sample that breaks the constraint is counted.
+        kinks: Phases at which its ``funnel`` is not smooth; the verdict looks there.
         tolerance: How far a motion may be outside the condition and still be called valid.
         budget: Acceptable violation while training.
         weight: First weight of the violation while training.
     """
 
     reason: ClassVar[str]
+    kinks: ClassVar[tuple[float, ...]] = ()
 
     tolerance: float
     budget: float = field("acceptable violation while training (the paper's C-bar^2)", low=0.0, default=0.0)

@@ -49,7 +49,7 @@ class Arm:
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._data = robot.model, robot.model.createData()
-        self._frame = robot.model.getFrameId(robot.tip)
+        self._frame = robot.tip_frame
         joints = robot.chain.joints
         slides = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper)) * 1.01
         lengths = [

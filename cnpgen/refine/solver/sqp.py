@@ -13,7 +13,9 @@ Once a step has changed the objective by less than the tolerance, and promised n
 next ones to what makes the iterate feasible: it lands.
 """
 
-from dataclasses import dataclass
+import math
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,9 @@ LANDING = 1.0  # weight of the proximal term once the objective has settled: wha
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
 NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; share of the promised gain
+LAST_STEPS = 3  # before a deadline land
+SHORTEST = 30.0  # weight of the proximal term in these: nothing but the shortest way to what is feasible counts
+UNEVEN = 1.3  # times the longest step that there was is left for the next
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
@@ -83,7 +88,7 @@ class Result:
     ended: bool
 
 
-def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings) -> Result:
+def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, until: float = math.inf) -> Result:
     """Minimise from x.
 
     Args:
@@ -91,13 +96,24 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
         bounds: Bounds of its residuals.
         x: First variables, shape (nx,).
         settings: How to iterate.
+        until: When to be done, as ``time.perf_counter`` counts [s]: the last steps before it land on what is feasible.
     """
     descent = _Descent(motion, bounds, settings, x)
-    iteration = 0
-    while iteration < settings.max_iterations and not descent.ended:
+    feasible: Result | None = None
+    iteration, longest, begun = 0, 0.0, time.perf_counter()
+    while iteration < settings.max_iterations and not descent.ended and begun + longest <= until:
+        descent.landing = begun + LAST_STEPS * longest > until
         iteration += 1
         descent.advance()
-    return Result(descent.x, descent.cost, descent.violation, iteration, descent.ended)
+        longest, begun = max(longest, UNEVEN * (time.perf_counter() - begun)), time.perf_counter()
+        if until < math.inf and descent.violation < settings.violation_tolerance:
+            feasible = _cheaper(feasible, descent.result(iteration))
+    last = descent.result(iteration)
+    return last if descent.ended or feasible is None else replace(feasible, iterations=iteration)
+
+
+def _cheaper(one: Result | None, other: Result) -> Result:
+    return other if one is None or other.cost < one.cost else one
 
 
 class _Descent:
@@ -108,7 +124,10 @@ class _Descent:
         cost: Objective there.
         violation: Worst violation there.
         ended: Whether there is nothing more to gain.
+        landing: Whether all that is still wanted is to become feasible.
     """
+
+    landing = False
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
         at = motion.evaluate(x)
@@ -125,12 +144,16 @@ class _Descent:
         self._settled = False
         self._missed = np.zeros(at.g.shape, bool)  # residuals that a rejected step broke unseen
 
+    def result(self, iterations: int) -> Result:
+        """Return where the iteration is."""
+        return Result(self.x, self.cost, self.violation, iterations, self.ended and not self.landing)
+
     def advance(self) -> None:
         """Try a step: take it, or know better for the next one."""
         at = self._at = self._at or self._motion.evaluate(self.x)
         held = self._held(at)
         settings = self._settings
-        proximal = LANDING if self._settled else settings.proximal
+        proximal = SHORTEST if self.landing else LANDING if self._settled else settings.proximal
         model = QuadraticModel(self._motion, at, self._bounds, self.violation, proximal, settings.penalty)
         step = self._propose(model, held)
         if step is None:
@@ -183,7 +206,7 @@ class _Descent:
             elif reduction < POOR * predicted:
                 self._radius *= 0.5
             self._settled = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
-            self.ended = self._settled and violation < settings.violation_tolerance
+            self.ended = (self._settled or self.landing) and violation < settings.violation_tolerance
             self._at, self.x, self.cost, self.violation, self._length = None, x, cost, violation, size
             self._missed[:] = False
         else:

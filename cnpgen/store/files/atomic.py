@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -95,14 +96,23 @@ def write_file(path: Path, content: bytes | str, *, work: Path | None = None) ->
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def read_file(path: Path) -> bytes:
+def read_file(path: Path, *, most: int | None = None) -> bytes:
     """Read a whole file.
 
+    Args:
+        path: The file.
+        most: Size that it may have [bytes]; as large as it is by default.
+
     Raises:
-        DatasetError: There is no such file.
+        DatasetError: There is no such file, it is a device or a pipe, which has no end, or it is too large.
         MachineError: The system would not let us read it.
     """
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+            raise DatasetError(f"{path} is not a file")
+        if most is not None and status.st_size > most:
+            raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {most:,}")
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError) as error:
         raise DatasetError(f"{path} is missing") from error

@@ -16,10 +16,14 @@ import numpy as np
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import read_file, write_file
+from cnpgen.store.files.forms import Form, check_form
+from cnpgen.store.files.limits import DOCUMENT_BYTES, DOCUMENT_DEPTH
 
 SHOWN = 80  # characters of two values that a message still shows
 _BLANK = "0" * 64
 _SCALARS = frozenset({int, bool, str, type(None)})  # types that are JSON's own, whatever the value
+_NESTED = frozenset({dict, list})
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # of half a character, which needs another half
 _SEAL = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
 
 
@@ -110,19 +114,21 @@ def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None 
     write_file(path, _SEAL.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
 
 
-def load_document(path: Path, kind: str, *, version: int) -> dict[str, Any]:
+def load_document(path: Path, kind: str, *, version: int, form: Form) -> dict[str, Any]:
     """Read a sealed document.
 
     Args:
         path: The file.
         kind: The "format" that it must have.
         version: The newest "format_version" that the caller understands.
+        form: What it must hold, see ``cnpgen.store.files.forms``.
 
     Returns:
         Its content without the seal.
 
     Raises:
-        DatasetError: It is missing, cut off, changed since it was written, of another kind or from a newer cnpgen.
+        DatasetError: It is missing, cut off, changed since it was written, too large, of another kind or form, or from
+            a newer cnpgen.
         MachineError: The system would not let us read it.
     """
     text, document = _parse(path)
@@ -136,17 +142,52 @@ def load_document(path: Path, kind: str, *, version: int) -> dict[str, Any]:
     if found is None or seal is None or seal[1] != hashlib.sha256(blank.encode()).hexdigest():
         raise DatasetError(f"{path} is damaged: it was changed after it was written")
     del document["self_sha256"]
+    try:
+        check_form(document, form)
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: {error}") from error
     return document
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON that somebody else may have written.
+
+    Raises:
+        ValueError: It is none, is nested deeper than any document, or has texts that are no texts.
+    """
+    try:
+        value = json.loads(text)
+    except RecursionError as error:
+        raise _too_deep() from error
+    _check_depth(value)
+    if _SURROGATE.search(text):
+        json.dumps(value, ensure_ascii=False).encode()  # half a character is a ValueError
+    return value
+
+
+def _check_depth(value: Any) -> None:
+    level: list[Any] = [value] if isinstance(value, dict | list) else []
+    for _ in range(DOCUMENT_DEPTH + 1):
+        if not level:
+            return
+        inside = (each.values() if isinstance(each, dict) else each for each in level)
+        level = [item for items in inside if not _NESTED.isdisjoint(map(type, items)) for item in items]
+        level = [item for item in level if isinstance(item, dict | list)]
+    raise _too_deep()
+
+
+def _too_deep() -> ValueError:
+    return ValueError(f"it has more than {DOCUMENT_DEPTH} tables and lists in one another")
 
 
 def _parse(path: Path) -> tuple[str, dict[str, Any]]:
     """Return a JSON object's text and content."""
-    content = read_file(path)
+    content = read_file(path, most=DOCUMENT_BYTES)
     if not content:
         raise DatasetError(f"{path} is damaged: it is empty")
     try:
         text = content.decode()
-        document = json.loads(text)
+        document = parse_json(text)
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: not JSON ({error})") from error
     if not isinstance(document, dict):

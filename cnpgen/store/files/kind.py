@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
-_OURS = re.compile(rb"cnpgen[- ]([a-z]+) [0-9]")  # of models and checkpoints, which are sealed, and of journals
+_OURS = re.compile(rb"cnpgen[- ]([a-z]+) [0-9]")  # of plans, models and checkpoints, and of journals
 _SIGNATURES = {
     HDF5: "an HDF5 file",
     b"PK\x03\x04": "a zip archive, as .npz files are",
@@ -13,13 +13,19 @@ _SIGNATURES = {
     b"PAR1": "a Parquet file",
     b"\x80": "a pickle",
 }
+PLANS = "a file of plans"
 _HEAD = 256  # bytes that are looked at
 
 
 def own_kind(head: bytes) -> str:
     """Say what a file of cnpgen's own formats is, from its first bytes: "a model of cnpgen"; else nothing."""
     found = _OURS.match(head)
-    return f"a {found[1].decode()} of cnpgen" if found else ""
+    return kind_name(found[1].decode()) if found else ""
+
+
+def kind_name(word: str) -> str:
+    """Name a kind of file by the word that its seal has for it: "a model of cnpgen", or "a file of plans"."""
+    return PLANS if word == "plans" else f"a {word} of cnpgen"
 
 
 def seeming(path: Path) -> str:

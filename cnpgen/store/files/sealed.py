@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files.atomic import read_file, write_file
-from cnpgen.store.files.hdf5 import create_hdf5
-from cnpgen.store.files.kind import seeming
+from cnpgen.store.files.atomic import machine_error, read_file, write_file
+from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
+from cnpgen.store.files.kind import kind_name, seeming
 
 BLOCK = 512  # bytes of the seal
 _SEAL = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")
@@ -62,9 +62,61 @@ def seal(content: Content, *, kind: str, version: int) -> bytes:
             file.create_dataset(name, data=values, track_times=False)
         for name, text in content.texts.items():
             file.create_dataset(name, data=np.frombuffer(text.encode(), np.uint8), track_times=False)
-    body = buffer.getvalue()[BLOCK:]
+    return under_seal(buffer.getvalue(), kind=kind, version=version)
+
+
+def under_seal(content: bytes, *, kind: str, version: int) -> bytes:
+    """Put the seal into the first block of an HDF5 file, which must have been left free.
+
+    Args:
+        content: The bytes of the file.
+        kind: What it is: ``cnpgen-`` and one word.
+        version: Version of its format.
+    """
+    body = content[BLOCK:]
     head = f"{kind} {version}\nsha256 {hashlib.sha256(body).hexdigest()}\n"
     return head.encode().ljust(BLOCK, b"\0") + body
+
+
+def has_seal(path: Path, *, kind: str, version: int) -> bool:
+    """Whether a file of a kind that need not be sealed is; a seal that is there must be the right one.
+
+    Args:
+        path: The file.
+        kind: What it would be under a seal.
+        version: The newest version of its format that the caller understands.
+
+    Raises:
+        DatasetError: It is cut off, damaged, or from a newer cnpgen.
+        MachineError: The system would not let us read it.
+    """
+    try:
+        with path.open("rb") as file:
+            block = file.read(BLOCK)
+            if not block.startswith(f"{kind} ".encode()):
+                return False
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise machine_error("read", path, error) from error
+    _check_seal(path, block, digest, kind=kind, version=version)
+    return True
+
+
+def _check_seal(path: Path, block: bytes, digest: str, *, kind: str, version: int) -> None:
+    """Refuse a file whose first block is not the right seal for the sha256 of what follows."""
+    head, what = _SEAL.match(block), kind_name(kind.removeprefix("cnpgen-"))
+    if head is None:
+        raise DatasetError(f"{path} is not {what}, or its beginning is damaged{seeming(path)}")
+    if head[1].decode() != kind:
+        raise DatasetError(f"{path} is {kind_name(head[1].decode().removeprefix('cnpgen-'))}, not {what}")
+    if int(head[2]) > version:
+        raise DatasetError(
+            f"{path} has format version {int(head[2])}, this cnpgen reads up to {version}: upgrade cnpgen"
+        )
+    if int(head[2]) < 1 or block != head[0].ljust(BLOCK, b"\0"):
+        raise DatasetError(f"{path} is damaged: its first {BLOCK} bytes are not as they were written")
+    if digest.encode() != head[3]:
+        raise DatasetError(f"{path} is damaged or cut off: its sha256 is not the one it was written with")
 
 
 def read_sealed(path: Path, *, kind: str, version: int) -> Content:
@@ -79,22 +131,12 @@ def read_sealed(path: Path, *, kind: str, version: int) -> Content:
         DatasetError: It is missing, of another kind, cut off, damaged, or from a newer cnpgen.
         MachineError: The system would not let us read it.
     """
-    import h5py
-
     data = read_file(path)
-    head = _SEAL.match(data[:BLOCK])
-    what = kind.removeprefix("cnpgen-")
-    if head is None:
-        raise DatasetError(f"{path} is not a {what} of cnpgen, or its beginning is damaged{seeming(path)}")
-    if head[1].decode() != kind:
-        raise DatasetError(f"{path} is a {head[1].decode().removeprefix('cnpgen-')} of cnpgen, not a {what}")
-    if int(head[2]) > version:
-        raise DatasetError(
-            f"{path} has format version {int(head[2])}, this cnpgen reads up to {version}: upgrade cnpgen"
-        )
-    if hashlib.sha256(data[BLOCK:]).hexdigest().encode() != head[3]:
-        raise DatasetError(f"{path} is damaged or cut off: its sha256 is not the one it was written with")
-    with h5py.File(io.BytesIO(data), "r") as file:
-        values = {name: item[()] for name, item in file.items()}
-    texts = {name: value.tobytes().decode() for name, value in values.items() if value.dtype == np.uint8}
+    _check_seal(path, data[:BLOCK], hashlib.sha256(data[BLOCK:]).hexdigest(), kind=kind, version=version)
+    with opened_hdf5(path, data) as file:
+        values = {name: item.read() for name, item in file.columns().items()}
+    try:
+        texts = {name: value.tobytes().decode() for name, value in values.items() if value.dtype == np.uint8}
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is damaged: it has a text that is not UTF-8") from error
     return Content({name: value for name, value in values.items() if name not in texts}, texts)

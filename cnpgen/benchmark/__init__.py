@@ -1,0 +1,1 @@
+"""Planners compared: the same problems, the same judge, the same simulator."""

@@ -1,0 +1,84 @@
+"""What planners return, executed: plans and sampled trajectories alike, in the scene of their boundary problem."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.benchmark.turns import Lead
+from cnpgen.errors import UsageError
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.record import open_problem
+from cnpgen.simulator.execute import Execution, execute
+from cnpgen.simulator.executed import Executed
+from cnpgen.simulator.plant import Plant
+from cnpgen.simulator.reference import Reference, StatesAt, make_reference, states_of
+from cnpgen.simulator.scene import Scene
+from cnpgen.simulator.simulate import scene_of
+
+Array = NDArray[np.float64]
+Task = tuple[Plans, Plans | Trajectory, Lead | None]
+"""One boundary problem, one plan or a trajectory for it, and of a turn the first motion."""
+
+
+def execute_answer(task: Task, *, plant: Plant) -> Executed:
+    """Execute what a planner returned; what cannot be executed is said in ``failure``.
+
+    Args:
+        task: The problem and the answer.
+        plant: The robot.
+    """
+    try:
+        return execution_of(*task, plant)[2].executed
+    except UsageError as error:
+        return Executed(failure=str(error))
+
+
+def execution_of(
+    problem: Plans, answer: Plans | Trajectory, lead: Lead | None, plant: Plant
+) -> tuple[Scene, Reference, Execution]:
+    """Execute what a planner returned.
+
+    Args:
+        problem: One boundary problem.
+        answer: One plan or a trajectory.
+        lead: Of a turn the first motion, which is executed up to the turn; else None.
+        plant: The robot.
+
+    Returns:
+        The world, what the controller followed, and what happened.
+
+    Raises:
+        UsageError: It cannot be executed.
+        RecipeError: MuJoCo cannot simulate the robot.
+        MachineError: MuJoCo is missing.
+    """
+    states, duration = _timed(answer)
+    if lead is not None:
+        states, duration = joined(lead, states), float(lead.until[0]) + duration
+    limit = open_problem(problem.problem)[1].acceleration_limit
+    reference, scene = make_reference(states, duration, acceleration_limit=limit), scene_of(problem, plant)
+    start_dq = problem.boundary.start_dq[0] if lead is None else None
+    return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0], start_dq)
+
+
+def joined(lead: Lead, states: StatesAt) -> StatesAt:
+    """Join the first part of a motion with what follows at the turn.
+
+    Args:
+        lead: One first motion.
+        states: What follows, from time 0 on.
+    """
+    first, until = states_of(lead.motion), float(lead.until[0])
+
+    def at(t: Array) -> tuple[Array, Array, Array]:
+        before, after = first(np.minimum(t, until)), states(np.maximum(t - until, 0.0))
+        q, dq, ddq = (np.where((t < until)[:, None], a, b) for a, b in zip(before, after, strict=True))
+        return q, dq, ddq
+
+    return at
+
+
+def _timed(answer: Plans | Trajectory) -> tuple[StatesAt, float]:
+    if isinstance(answer, Plans):
+        return states_of(answer.motion), float(answer.duration[0])
+    return answer.states, answer.duration

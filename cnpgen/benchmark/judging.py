@@ -1,0 +1,75 @@
+"""What planners return, judged: plans as ``cnpgen evaluate`` does it, sampled trajectories by the same constraints.
+
+A sampled trajectory is looked at every millisecond, as the controller that executes it does. No spline is fitted to it:
+a fit would smooth away what it exceeds. Where it is linear between its samples, its acceleration is what the jumps of
+its velocity are, seen over a millisecond.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.judges.plans.course import Course
+from cnpgen.judges.plans.judge import reason_of
+from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
+from cnpgen.judges.plans.metrics import metrics_of
+from cnpgen.judges.plans.paper import paper_rule
+from cnpgen.judges.plans.sampling import Samples
+from cnpgen.judges.plans.verdict import Reason, Verdict
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.record import ProblemRecord, open_problem
+from cnpgen.world.path import PathWorld
+
+Array = NDArray[np.float64]
+
+STEP = 1e-3  # s
+LONGEST = 60.0  # s: motion time
+
+
+def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
+    """Judge what a planner returned for a boundary problem.
+
+    Args:
+        problem: One boundary problem, as plans that are still to be made.
+        answer: One plan or a trajectory.
+    """
+    if isinstance(answer, Plans):
+        return evaluate_plans(answer, workers=1).verdicts[0]
+    if answer.duration > LONGEST:
+        return Verdict(Reason.TOO_LONG)
+    t = np.linspace(0, answer.duration, int(np.ceil(answer.duration / STEP)) + 1)
+    with np.errstate(all="ignore"):
+        return _judge(problem, Samples(t / answer.duration, t), _course(answer, t))
+
+
+def _judge(problem: Plans, samples: Samples, states: Course) -> Verdict:
+    meaning, robot = open_problem(problem.problem)
+    goal_xyz = problem.columns["goal_xyz"][0]
+    tops = obstacle_tops(meaning, problem.columns["start_xyz"][0], goal_xyz)
+    world = _world(problem.problem)
+    world.set_path(states.q, states.dq, states.ddq, tops)
+    start_tip = world.tip_position[:, 0]
+    margins = boundary_margins(states, problem.boundary, samples, robot.joint_names)
+    for constraint in meaning.constraint:
+        margins += [each.margin(meaning, samples) for each in measure(constraint, world, samples.s, start_tip)]
+    metrics = metrics_of(meaning, world, samples, np.full_like(states.q, np.nan))
+    paper = paper_rule(meaning, world, tops, goal_xyz)
+    return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.t))
+
+
+def _course(answer: Trajectory, t: Array) -> Course:
+    """Evaluate a trajectory at times, joint by joint."""
+    q, dq, ddq = answer.states(t)
+    if answer.dq is None:
+        ddq = np.gradient(dq, t, axis=0)
+    return Course(*(np.ascontiguousarray(values.T) for values in (q, dq, ddq)))
+
+
+@lru_cache(maxsize=2)
+def _world(record: ProblemRecord) -> PathWorld:
+    problem, robot = open_problem(record)
+    return PathWorld(robot, problem.obstacle, problem.object_size)

@@ -1,0 +1,138 @@
+"""Anchored quadratic programming (docs/references.md, 2), which the authors of the paper compare hits with.
+
+First a path of the tip in the plane, two lines and an arc, with constant acceleration up to the hit; then, sample by
+sample, the joint velocity that follows it, by a quadratic programme in the null space of the tip's Jacobian that draws
+the arm towards the hitting configuration. It knows limits of positions and velocities, and none of accelerations.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.plane import PlanePath, stopping_path, striking_path
+from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.errors import UsageError
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.record import open_problem
+from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.01  # s: of the samples, shortened so that the last one before the stop is the hit
+WEIGHTS = (1.0, 1.0, 5.0, 1.0, 10.0, 10.0, 0.01)  # of the joints
+PULL = 0.5  # s: in which the anchor draws the arm to itself
+ROOM = 0.95  # of the joint limits
+SLOWER, TRIES = 0.9, 10  # hit speed after a failure, and how often
+
+
+@dataclass(frozen=True)
+class AQP(BenchmarkPlanner):
+    """Anchored quadratic programming along a path in the plane (Liu et al., 2021)."""
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Check that there is a table to plan on."""
+        problem, robot = open_problem(setting.problem)
+        table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+        if table is None or robot.n > len(WEIGHTS):
+            raise UsageError(f"it plans hits on a table with up to 7 joints, {problem.name!r} is none")
+
+        def plan(task: Plans) -> Answer:
+            return _Follower(robot, task).plan(table.z)
+
+        return plan
+
+
+class _Follower:
+    """Follows a path in the plane with the joints."""
+
+    def __init__(self, robot: Robot, task: Plans) -> None:
+        self._robot, self._boundary = robot, task.boundary
+        self._tip = Tip(robot)
+        self._goal = task.columns["goal_xyz"][0]
+        self._weights = np.array(WEIGHTS[: robot.n])
+
+    def plan(self, height: float) -> Trajectory | None:
+        """Plan as fast a hit as can be followed, down to a third of the speed that was asked for."""
+        start, _, _ = self._tip.at(self._boundary.start_q[0])
+        velocity = self._tip.at(self._boundary.goal_q[0])[2][:3] @ self._boundary.goal_dq[0]
+        speed = float(np.linalg.norm(velocity[:2]))
+        if speed == 0:
+            raise UsageError("it plans hits, and this motion ends at rest")
+        for _ in range(TRIES):
+            strike = striking_path(start[:2], self._goal[:2], velocity[:2], speed)
+            stop = stopping_path(strike)
+            found = self._follow(strike, stop, height)
+            if found is not None:
+                return found
+            speed *= SLOWER
+        return None
+
+    def _follow(self, strike: PlanePath, stop: PlanePath, height: float) -> Trajectory | None:
+        """Follow both parts; None where a quadratic programme has no solution."""
+        from scipy.interpolate import CubicSpline
+
+        count = max(int(np.ceil(strike.duration / PERIOD)), 2)
+        period = strike.duration / count
+        samples = np.array([*strike.sampled(period), *stop.sampled(period)])
+        t = period * np.arange(len(samples) + 1.0)
+        q = [self._boundary.start_q[0]]
+        dq = self._boundary.start_dq[0]
+        for sample, now in zip(samples, t[1:], strict=True):
+            following = self._velocity(
+                q[-1], np.append(sample, height), period, self._towards(q[-1], now, t[count], t[-1])
+            )
+            if following is None:
+                return None
+            q.append(q[-1] + (dq + following) / 2 * period)
+            dq = following
+        spline = CubicSpline(t, np.array(q), bc_type="clamped")
+        until = slice(0, count + 1)
+        return Trajectory(t[until], np.array(q)[until], np.asarray(spline(t, 1))[until])
+
+    def _towards(self, q: Array, now: float, hit: float, end: float) -> Array:
+        """Return the velocity towards the anchor: the more, the nearer the hit, and less and less after it."""
+        pull = (self._boundary.goal_q[0] - q) / PULL
+        if now > hit:
+            return np.asarray((end - now) / (end - hit) * pull)
+        share = now / hit
+        return np.asarray(share * pull + np.clip(1 - share, 0, 1) * self._boundary.start_dq[0])
+
+    def _velocity(self, q: Array, wanted: Array, period: float, towards: Array) -> Array | None:
+        """Solve for the joint velocity that brings the tip to where it is wanted, nearest to the anchor's."""
+        robot, (tip, _, J) = self._robot, self._tip.at(q)
+        J = J[:3]
+        least = J.T @ np.linalg.solve(J @ J.T, (wanted - tip) / period)
+        null = np.linalg.svd(J)[2][3:].T
+        low = np.maximum(-robot.velocity_limit, (ROOM * robot.position_lower - q) / period)
+        high = np.minimum(robot.velocity_limit, (ROOM * robot.position_upper - q) / period)
+        along = nearest_in_null_space(null, self._weights, least - towards, (low - least, high - least))
+        return None if along is None else np.asarray(least + null @ along)
+
+
+def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]) -> Array | None:
+    """Minimise ``a^T N^T W N a / 2 + ahead^T W N a`` with ``low <= N a <= high``, by DAQP.
+
+    Args:
+        null: N, shape (n, k).
+        weights: Diagonal of W, shape (n,).
+        ahead: By how much the velocity without ``a`` is ahead of the wanted one [rad/s], shape (n,).
+        bounds: ``(low, high)`` [rad/s], shape (n,) each.
+
+    Returns:
+        a, shape (k,), or None where nothing is within the bounds.
+    """
+    import daqp
+
+    weighted = weights[:, None] * null
+    hessian, gradient = null.T @ weighted, weighted.T @ ahead
+    low, high = (np.ascontiguousarray(bound) for bound in bounds)
+    if np.any(low > high):
+        return None
+    found, _, status, _ = daqp.solve(
+        np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), np.ascontiguousarray(null), high, low
+    )
+    return np.array(found) if status > 0 else None

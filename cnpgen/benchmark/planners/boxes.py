@@ -1,0 +1,53 @@
+"""Points and boxes: how near, how deep, and in which direction out; the corners of the held object."""
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
+
+Array = NDArray[np.float64]
+Box = tuple[Array, Array]
+"""Lower and upper corner [m], shape (3,) each; an obstacle reaches down without end."""
+
+CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+
+
+def boxes_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> tuple[Array, list[Box]]:
+    """Return the edge lengths of the held object [m], shape (3,), and the obstacles.
+
+    Args:
+        problem: The problem.
+        start_xyz: Where the tip begins [m], shape (3,).
+        goal_xyz: Where it ends [m], shape (3,).
+
+    Raises:
+        UsageError: Nothing is held.
+    """
+    if problem.object_size is None:
+        raise UsageError(f"it plans hits on a table and transports, and {problem.name!r} has neither table nor object")
+    tops = obstacle_tops(problem, start_xyz, goal_xyz)
+    low = [np.array([box.x.low, box.y.low, -np.inf]) for box in problem.obstacle]
+    high = [np.array([box.x.high, box.y.high, top]) for box, top in zip(problem.obstacle, tops.tolist(), strict=True)]
+    return np.array(problem.object_size), list(zip(low, high, strict=True))
+
+
+def distance(point: Array, box: Box) -> tuple[float, Array]:
+    """Return how far a point is from a box [m], 0 inside, and the gradient of that, shape (3,)."""
+    offset = point - np.clip(point, *box)
+    length = float(np.linalg.norm(offset))
+    return length, offset / length if length > 0 else np.zeros(3)
+
+
+def depth(point: Array, box: Box) -> tuple[float, Array]:
+    """Return how deep a point is in a box [m], 0 outside, and the gradient of that, shape (3,)."""
+    rooms = np.concatenate([point - box[0], box[1] - point])
+    least = int(np.argmin(rooms))
+    normal = np.zeros(3)
+    if rooms[least] <= 0:
+        return 0.0, normal
+    normal[least % 3] = 1.0 if least < 3 else -1.0
+    return float(rooms[least]), normal

@@ -1,0 +1,172 @@
+"""Constrained bidirectional rapidly exploring trees: OMPL's RRTConnect on a projected state space.
+
+Its constraint, one-dimensional, is the height of the tip or the tilt of the object, to 0.01; it knows neither
+velocities nor accelerations. The path is timed by the velocity limits alone and followed linearly, as the paper's
+authors did it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.boxes import CORNERS, boxes_of, depth, distance
+from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.errors import MachineError
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import open_problem
+from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+TOLERANCE, PROJECTIONS, DELTA, LAMBDA = 0.01, 50, 0.05, 2.0  # of the manifold; the last three are OMPL's own
+GOAL = 0.01  # rad: how far from the goal a path may end
+APART, DEEP = 0.14, 0.01  # m: of the object's centre from pedestals, and of a corner in one
+PAUSE = 1e-4  # s: added to the time of every step
+
+
+@dataclass(frozen=True)
+class CBiRRT(BenchmarkPlanner):
+    """Bidirectional trees on the constraint manifold (OMPL's RRTConnect on ProjectedStateSpace)."""
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Import OMPL."""
+        ompl = _ompl()
+        ompl.util.RNG.setSeed(setting.seed + 1)
+        ompl.util.setLogLevel(ompl.util.LogLevel.LOG_NONE)
+        problem, robot = open_problem(setting.problem)
+
+        def plan(task: Plans) -> Answer:
+            search = Search(problem, robot, task)
+            path = search.solve(ompl, setting.time_limit)
+            return None if path is None else timed(path, robot.velocity_limit)
+
+        return plan
+
+
+def _ompl() -> Any:
+    try:
+        import ompl.base
+        import ompl.geometric
+        import ompl.util
+    except ImportError as error:
+        raise MachineError(f"OMPL cannot be imported ({error}): pip install 'cnpgen[benchmark]'") from error
+    return ompl
+
+
+def timed(path: Array, velocity_limit: Array) -> Trajectory:
+    """Time a path so that in every step one joint is at its velocity limit.
+
+    Args:
+        path: Joint positions [rad], shape (K, n).
+        velocity_limit: Planning limits [rad/s], shape (n,).
+    """
+    steps = np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + PAUSE
+    return Trajectory(np.append(0.0, np.cumsum(steps)), path)
+
+
+class Search:
+    """What is asked of states of one boundary problem.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        task: The boundary problem.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, task: Plans) -> None:
+        self._robot, self._tip = robot, Tip(robot)
+        self._ends = task.boundary.start_q[0], task.boundary.goal_q[0]
+        self._table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+        self._data = robot.model.createData()
+        if self._table is None:
+            ends = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
+            self._size, self._boxes = boxes_of(problem, *ends)
+
+    def tip(self, q: Array) -> Array:
+        """Return where the tip is [m], shape (3,)."""
+        return self._tip.at(q)[0]
+
+    def residual(self, q: Array) -> tuple[float, Array]:
+        """Return by how much q is off the manifold [m, or 1], and the derivative of that, shape (n,)."""
+        position, rotation, J = self._tip.at(q)
+        if self._table is not None:
+            return float(position[2] - self._table.z), J[2]
+        return float(rotation[2, 2] - 1.0), np.cross(J[3:].T, rotation[:, 2])[:, 2]
+
+    def is_valid(self, q: Array) -> bool:
+        """Whether the tip is over the table; or the object apart from the pedestals and the arm strong enough."""
+        import pinocchio as pin
+
+        position, rotation, _ = self._tip.at(q)
+        if self._table is not None:
+            x, y = self._table.x, self._table.y
+            return bool(x.low <= position[0] <= x.high and y.low <= position[1] <= y.high)
+        holding = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
+        if np.any(np.abs(holding) > self._robot.torque_limit):
+            return False
+        corners = position + (CORNERS * self._size) @ rotation.T
+        return all(
+            distance(position, box)[0] > APART and all(depth(corner, box)[0] < DEEP for corner in corners)
+            for box in self._boxes
+        )
+
+    def solve(self, ompl: Any, time_limit: float) -> Array | None:
+        """Search for a path: joint positions [rad], shape (K, n), or None."""
+        base = ompl.base
+        space = base.RealVectorStateSpace(self._robot.n)
+        space.setBounds(_bounds(base, self._robot))
+        constraint = _constraint(base, self._robot.n, self.residual)
+        manifold = base.ProjectedStateSpace(space, constraint)
+        manifold.setDelta(DELTA)
+        manifold.setLambda(LAMBDA)
+        about = base.ConstrainedSpaceInformation(manifold)
+        setup = ompl.geometric.SimpleSetup(about)
+        setup.setStateValidityChecker(lambda state: self.is_valid(self._positions(state)))
+        ends = [manifold.allocState() for _ in self._ends]
+        for state, q in zip(ends, self._ends, strict=True):
+            state.copy(q.tolist())
+        setup.setStartAndGoalStates(*ends, GOAL)
+        setup.setPlanner(ompl.geometric.RRTConnect(about))
+        setup.setup()
+        setup.solve(time_limit)
+        if not setup.haveExactSolutionPath():
+            return None
+        path = setup.getSolutionPath()
+        path.interpolate()
+        return np.array([self._positions(state) for state in path.getStates()])
+
+    def _positions(self, state: Any) -> Array:
+        return np.array([state[index] for index in range(self._robot.n)])
+
+
+def _bounds(base: Any, robot: Robot) -> Any:
+    bounds = base.RealVectorBounds(robot.n)
+    for index, (low, high) in enumerate(zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)):
+        bounds.setLow(index, low)
+        bounds.setHigh(index, high)
+    return bounds
+
+
+def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Array]]) -> Any:
+    """Wrap a residual for OMPL."""
+
+    class Manifold(base.Constraint):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__(n, 1, TOLERANCE)
+
+        def function(self, x: Any, out: Any) -> None:
+            out[0] = residual(np.array(x))[0]
+
+        def jacobian(self, x: Any, out: Any) -> None:
+            out[0, :] = residual(np.array(x))[1]
+
+    found = Manifold()
+    found.setMaxIterations(PROJECTIONS)
+    return found

@@ -1,0 +1,89 @@
+"""The constraints of TrajOpt at its knots, with Pinocchio and by their analytic derivatives (docs/benchmark.md)."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.planners.boxes import CORNERS, Box, boxes_of, depth, distance
+from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+KnotConstraints = Callable[[Array, Array, Array], tuple[Array, tuple[Array, Array, Array]]]
+"""Of positions, velocities and accelerations at K knots, shape (K, n) each: values that must not be negative, shape
+(K, m), and their derivatives in the three, shape (K, m, n) each."""
+
+TABLE = 0.01  # m: how far from its height the tip may be
+APART = 0.15  # m: of the object's centre from the pedestals
+
+
+def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz: Array) -> KnotConstraints:
+    """Return the constraints of a boundary problem: of a hit, or of a transport.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        start_xyz: Where the tip begins [m], shape (3,).
+        goal_xyz: Where it ends [m], shape (3,).
+
+    Raises:
+        UsageError: The problem has neither a table nor a held object.
+    """
+    table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+    if table is not None:
+        return _on_table(table, robot)
+    return _carrying(robot, *boxes_of(problem, start_xyz, goal_xyz))
+
+
+def _on_table(table: Table, robot: Robot) -> KnotConstraints:
+    """The tip over the table and at most 1 cm from its height; |y| and |z| as two inequalities each."""
+    signs = np.array([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    bound = np.array([-table.x.low, -table.y.low, table.y.high, TABLE - table.z, TABLE + table.z])
+    tip = Tip(robot)
+
+    def at(q: Array, _dq: Array, _ddq: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        found = [tip.at(each) for each in q]
+        g = np.array([signs @ position + bound for position, _, _ in found])
+        J = np.array([signs @ jacobian[:3] for _, _, jacobian in found])
+        return g, (J, np.zeros_like(J), np.zeros_like(J))
+
+    return at
+
+
+def _carrying(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
+    """The object upright, away from the boxes with its centre and outside with its corners; torques within limits."""
+    import pinocchio as pin
+
+    tip, model, data, limit = Tip(robot), robot.model, robot.model.createData(), robot.torque_limit
+
+    def of_the_object(q: Array) -> tuple[list[float], Array]:
+        position, rotation, J = tip.at(q)
+        turning = J[3:]
+        values, slopes = [rotation[2, 2] - 1.0], [np.cross(turning.T, rotation[:, 2])[:, 2]]
+        for box in boxes:
+            apart, out = distance(position, box)
+            values.append(min(apart - APART, 0.0))
+            slopes.append(out @ J[:3] * (apart < APART))
+            for corner in (CORNERS * size) @ rotation.T:
+                deep, out = depth(position + corner, box)
+                values.append(-deep)
+                slopes.append(-out @ (J[:3] + np.cross(turning.T, corner).T))
+        return values, np.array(slopes)
+
+    def knot(q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array, Array]:
+        values, slope = of_the_object(q)
+        pin.computeRNEADerivatives(model, data, q, dq, ddq)
+        inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
+        g = np.concatenate([values, limit - torque, limit + torque])
+        rows = [(slope, data.dtau_dq), (np.zeros_like(slope), data.dtau_dv), (np.zeros_like(slope), inertia)]
+        of_q, of_dq, of_ddq = (np.vstack([first, -torques, torques]) for first, torques in rows)
+        return g, of_q, of_dq, of_ddq
+
+    def at(q: Array, dq: Array, ddq: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        g, a, b, c = (np.array(part) for part in zip(*map(knot, q, dq, ddq), strict=True))
+        return g, (a, b, c)
+
+    return at

@@ -1,0 +1,33 @@
+"""Where the tip is and how it moves with the joints, with Pinocchio."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class Tip:
+    """The tip of a robot; it reuses Pinocchio's memory, so it belongs to one thread.
+
+    Args:
+        robot: The robot.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._model, self._data = robot.model, robot.model.createData()
+        self._frame = robot.model.getFrameId(robot.tip)
+
+    def at(self, q: Array) -> tuple[Array, Array, Array]:
+        """Return where it is at joint positions q [rad], shape (n,).
+
+        Returns:
+            Its position [m], shape (3,), its rotation, shape (3, 3), and its Jacobian in world axes, shape (6, n),
+            translation first.
+        """
+        import pinocchio as pin
+
+        J = pin.computeFrameJacobian(self._model, self._data, q, self._frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        pose = pin.updateFramePlacement(self._model, self._data, self._frame)
+        return np.array(pose.translation), np.array(pose.rotation), np.array(J)

@@ -1,0 +1,167 @@
+"""TrajOpt as the paper's authors ran it: direct collocation by SciPy's SLSQP, its quirks kept (docs/benchmark.md).
+
+Fifteen knots, explicit Euler steps of ``T / 15`` between them, T minimised, at most 100 iterations, from a cubic whose
+derivatives are not scaled by T. What comes out is sent with a spacing of ``T / 14``, as theirs was: it is a fifteenth
+slower than what was optimised.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.knots import KnotConstraints, knot_constraints
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.record import open_problem
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+KNOTS = 15
+SHORTEST = 0.1  # s
+
+
+@dataclass(frozen=True)
+class TrajOpt(BenchmarkPlanner):
+    """Sequential quadratic programming over knots (SciPy's SLSQP), as the paper's authors ran it."""
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Choose the constraints at the knots."""
+        problem, robot = open_problem(setting.problem)
+
+        def plan(task: Plans) -> Answer:
+            at_knots = knot_constraints(problem, robot, task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
+            return Transcription(robot, task.boundary, at_knots).solve()
+
+        return plan
+
+
+class Transcription:
+    """One boundary problem as a nonlinear programme.
+
+    Its variables are positions, velocities and accelerations at the knots where these are free, and T, in this order:
+    ``x = (q_1 .. q_13, dq_1 .. dq_13, ddq, T)``. Accelerations are free at all knots if the motion must not end at
+    rest; else those at both ends are 0.
+
+    Args:
+        robot: The robot.
+        boundary: Boundary conditions of one motion.
+        at_knots: Constraints at the inner knots.
+    """
+
+    def __init__(self, robot: Robot, boundary: Boundary, at_knots: KnotConstraints) -> None:
+        self._robot, self._boundary, self._at_knots = robot, boundary, at_knots
+        inner = KNOTS - 2
+        moving = bool(np.any(boundary.goal_dq))
+        self._free_ddq = slice(0, KNOTS) if moving else slice(1, KNOTS - 1)
+        accelerations = self._free_ddq.stop - self._free_ddq.start
+        counts = np.array([inner, inner, accelerations]) * robot.n
+        self._ends = np.cumsum(counts)
+        self._size = int(self._ends[-1]) + 1
+
+    def solve(self, iterations: int = 100) -> Trajectory | None:
+        """Minimise T and return the knots; None where they are not finite."""
+        from scipy.optimize import Bounds, minimize
+
+        first = self.start()
+        low, high = self.bounds()
+        gradient = np.zeros(self._size)
+        gradient[-1] = 1.0
+        constraints = [
+            {"type": "eq", "fun": self.defects, "jac": self.defects_jacobian},
+            {"type": "ineq", "fun": self.margins, "jac": self.margins_jacobian},
+        ]
+        found = minimize(
+            lambda x: x[-1],
+            np.clip(first, low, high),
+            jac=lambda _: gradient,
+            method="SLSQP",
+            bounds=Bounds(low, high),
+            constraints=constraints,
+            options={"maxiter": iterations},
+        )
+        if not np.isfinite(found.x).all():
+            return None
+        q, dq, ddq, duration = self.unpack(found.x)
+        return Trajectory(np.linspace(0, duration, KNOTS), q, dq, ddq)
+
+    def unpack(self, x: Array) -> tuple[Array, Array, Array, float]:
+        """Return positions, velocities and accelerations at all knots, shape (KNOTS, n) each, and T."""
+        n, b = self._robot.n, self._boundary
+        q, dq, free = (part.reshape(-1, n) for part in np.split(x[:-1], self._ends[:2]))
+        ddq = np.zeros((KNOTS, n))
+        ddq[self._free_ddq] = free
+        return np.vstack([b.start_q, q, b.goal_q]), np.vstack([b.start_dq, dq, b.goal_dq]), ddq, float(x[-1])
+
+    def start(self) -> Array:
+        """Return the cubic that the search begins with; its derivatives are those in its parameter."""
+        b = self._boundary
+        a = np.vstack([b.start_q, b.start_dq + 3 * b.start_q, 3 * b.goal_q - b.goal_dq, b.goal_q])
+        s = np.linspace(0, 1, KNOTS)
+        shape = np.polynomial.Polynomial
+        up, down = shape([0, 1]), shape([1, -1])
+        pieces = [down**3, down**2 * up, down * up**2, up**3]
+        q, dq, ddq = (np.array([piece.deriv(order)(s) for piece in pieces]).T @ a for order in range(3))
+        robot = self._robot
+        time = np.max(np.abs(dq) / robot.velocity_limit), np.sqrt(np.max(np.abs(ddq) / robot.acceleration_limit))
+        parts = [q[1:-1].ravel(), dq[1:-1].ravel(), ddq[self._free_ddq].ravel(), np.array([max(time)])]
+        return np.concatenate(parts)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the lower and upper bounds of the variables."""
+        robot, inner = self._robot, KNOTS - 2
+        free = self._free_ddq.stop - self._free_ddq.start
+        high = [np.tile(robot.position_upper, inner), np.tile(robot.velocity_limit, inner)]
+        low = [np.tile(robot.position_lower, inner), -high[1]]
+        acceleration = np.tile(robot.acceleration_limit, free)
+        return (
+            np.concatenate([*low, -acceleration, [SHORTEST]]),
+            np.concatenate([*high, acceleration, [np.inf]]),
+        )
+
+    def defects(self, x: Array) -> Array:
+        """Return what explicit Euler steps miss the next knot by, shape (2 (KNOTS - 1) n,)."""
+        q, dq, ddq, duration = self.unpack(x)
+        step = duration / KNOTS
+        return np.concatenate(
+            [(np.diff(q, axis=0) - step * dq[:-1]).ravel(), (np.diff(dq, axis=0) - step * ddq[:-1]).ravel()]
+        )
+
+    def defects_jacobian(self, x: Array) -> Array:
+        """Return the derivative of ``defects``."""
+        n, inner = self._robot.n, KNOTS - 2
+        _, dq, ddq, duration = self.unpack(x)
+        step, rows = duration / KNOTS, (KNOTS - 1) * n
+        ahead = np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]  # of the inner knots in differences
+        here = np.eye(KNOTS)[:-1]
+        unit = np.eye(n)
+        J = np.zeros((2 * rows, self._size))
+        first, second = slice(0, inner * n), slice(inner * n, 2 * inner * n)
+        J[:rows, first] = np.kron(ahead, unit)
+        J[:rows, second] = -step * np.kron(here[:, 1:-1], unit)
+        J[rows:, second] = np.kron(ahead, unit)
+        J[rows:, second.stop : -1] = -step * np.kron(here[:, self._free_ddq], unit)
+        J[:rows, -1], J[rows:, -1] = -dq[:-1].ravel() / KNOTS, -ddq[:-1].ravel() / KNOTS
+        return J
+
+    def margins(self, x: Array) -> Array:
+        """Return the constraints at the inner knots, not negative where they are met."""
+        q, dq, ddq, _ = self.unpack(x)
+        return np.asarray(self._at_knots(q[1:-1], dq[1:-1], ddq[1:-1])[0].ravel())
+
+    def margins_jacobian(self, x: Array) -> Array:
+        """Return the derivative of ``margins``."""
+        n, inner = self._robot.n, KNOTS - 2
+        q, dq, ddq, _ = self.unpack(x)
+        g, derivatives = self._at_knots(q[1:-1], dq[1:-1], ddq[1:-1])
+        rows = g.shape[1]
+        J = np.zeros((inner, rows, self._size))
+        offset = 1 - self._free_ddq.start
+        starts = 0, inner * n, 2 * inner * n + offset * n
+        for derivative, start in zip(derivatives, starts, strict=True):
+            for knot in range(inner):
+                J[knot, :, start + knot * n : start + (knot + 1) * n] = derivative[knot]
+        return J.reshape(inner * rows, self._size)

@@ -1,0 +1,137 @@
+"""A report of a benchmark as one HTML file: tables beside the paper's figures, box plots, a picture."""
+
+import base64
+import io
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from cnpgen.benchmark.execution import execution_of
+from cnpgen.benchmark.results import answer_from_dict
+from cnpgen.benchmark.run import Benchmark
+from cnpgen.benchmark.statistics import FIGURES, FLAGS, values_of
+from cnpgen.errors import MachineError
+from cnpgen.simulator.picture import save_picture
+from cnpgen.simulator.plant import as_plant
+from cnpgen.store.files.atomic import write_file
+
+PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> what the paper's text says of it
+    "hits-81": {
+        "cnp-b": {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
+        "aqp": {"scored": "92.59 %", "planning_ms": "42"},
+        "trajopt": {"scored": "91.35 %", "planning_ms": "about 10,000"},
+    },
+    "heavy-100": {
+        "cnp-b": {"paper_finished": "100 %", "paper_valid": "95 %"},
+        "cbirrt": {"paper_finished": "88 %", "paper_valid": "74 %"},
+    },
+    "hits-110": {"cnp-b": {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
+}
+_STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
+_STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
+
+
+def save_benchmark_report(benchmark: Benchmark, path: str | Path) -> Path:
+    """Write the report of a benchmark; a file that is there is replaced.
+
+    Args:
+        benchmark: What ``run_benchmark`` returned.
+        path: Where to, ``.html``.
+
+    Raises:
+        MachineError: matplotlib is missing, or the file cannot be written.
+    """
+    suite, place = benchmark.suite, Path(path)
+    parts = [
+        f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
+    ]
+    for plant in benchmark.plants or ("",):
+        title = f"executed by the {plant} plant" if plant else "planned"
+        parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
+    parts += _pictures(benchmark, place.parent)
+    head = f"<!doctype html><meta charset='utf-8'><title>{escape(suite.name)}</title><style>{_STYLE}</style>"
+    write_file(place, "\n".join([head, *parts]))
+    return place
+
+
+def _table(benchmark: Benchmark, plant: str) -> str:
+    """Lay out what ``table_rows`` returns."""
+    head, *rows = table_rows(benchmark, plant)
+    lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    note = "Medians [quartiles]; p: the chance of as large a difference from the reference planner, below 5 %."
+    return "\n".join([*lines, f"</table><p>{note}</p>"])
+
+
+def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
+    """Put ratios and figures beside each other: a head, then a row for each, with what the paper prints.
+
+    Args:
+        benchmark: What ``run_benchmark`` returned.
+        plant: The plant whose executions count; none if it is empty.
+    """
+    summary = benchmark.summary(plant)
+    printed = PRINTED.get(benchmark.suite.name, {})
+    rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
+    for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):
+        for key, text in texts.items():
+            cells = [cell_text(summary[name][group].get(key), printed.get(name, {}).get(key)) for name in summary]
+            if any(cells):
+                rows.append((text, *cells))
+    return rows
+
+
+def cell_text(found: dict[str, Any] | None, printed: str | None = None) -> str:
+    """Write a ratio or a figure in a few characters, with what the paper prints."""
+    if found is None:
+        return f"paper: {printed}" if printed else ""
+    if "share" in found:
+        text = f"{found['count']} of {found['of']}"
+    else:
+        text = f"{found['median']:.3g} [{found['q1']:.3g}, {found['q3']:.3g}]"
+    text += f", p {found['p']:.1g}" if found["p"] < 0.05 else ""
+    return text + (f" (paper: {printed})" if printed else "")
+
+
+def _boxes(benchmark: Benchmark, plant: str) -> str:
+    """Draw box plots of all figures."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
+    values = {name: [values_of(row, plant) for row in rows] for name, rows in benchmark.results.items()}
+    shown = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
+    figure = Figure(figsize=(4 * min(len(shown), 4), 3 * -(-len(shown) // 4)), layout="constrained")
+    for place, key in enumerate(shown, start=1):
+        axes = figure.add_subplot(-(-len(shown) // 4), min(len(shown), 4), place)
+        axes.boxplot([[row[key] for row in rows if key in row] for rows in values.values()])
+        axes.set_xticks(range(1, len(values) + 1), list(values), rotation=30, fontsize=7)
+        axes.set_title(FIGURES[key], fontsize=9)
+        if key == "planning_ms":
+            axes.set_yscale("log")
+    picture = io.StringIO()
+    figure.savefig(picture, format="svg", metadata={"Date": None})
+    return picture.getvalue().partition("?>\n")[2]
+
+
+def _pictures(benchmark: Benchmark, folder: Path) -> list[str]:
+    """Draw what each planner's robot had done at the end of its first plan, where this machine can draw."""
+    parts = []
+    for name, rows in benchmark.results.items() if benchmark.plants else ():
+        index = next((row["problem"] for row in rows if row["answer"] is not None), None)
+        if index is None:
+            continue
+        problem, lead = benchmark.problems[index], benchmark.lead and benchmark.lead[index]
+        answer = answer_from_dict(problem, rows[index]["answer"])
+        file = folder / f"{name}.png"
+        try:
+            scene, reference, execution = execution_of(problem, answer, lead, as_plant(benchmark.plants[0]))
+            save_picture(file, scene, execution, reference.ticks)
+        except MachineError as error:
+            return [f"<p>No pictures: {escape(str(error))}</p>"]
+        data = base64.b64encode(file.read_bytes()).decode()
+        parts.append(
+            f"<h3>{escape(name)}, problem {index}, at the end of its plan</h3><img src='data:image/png;base64,{data}'>"
+        )
+        file.unlink()
+    return parts

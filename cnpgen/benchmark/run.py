@@ -1,0 +1,219 @@
+"""Running a benchmark: every planner on every problem, judged and, if wanted, executed; what is finished stays."""
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.benchmark.execution import Task, execute_answer
+from cnpgen.benchmark.judging import judge_answer
+from cnpgen.benchmark.planner import Setting
+from cnpgen.benchmark.process import Attempt, PlannerProcess
+from cnpgen.benchmark.results import Results, answer_from_dict, answer_to_dict, open_results
+from cnpgen.benchmark.statistics import summarise_results
+from cnpgen.benchmark.suite import Suite, load_suite
+from cnpgen.benchmark.turns import Lead
+from cnpgen.errors import UsageError, nearest
+from cnpgen.judges.plans.verdict import Verdict
+from cnpgen.machine.versions import __version__
+from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem import resolved
+from cnpgen.schema import registry
+from cnpgen.schema.arguments import integer, number
+from cnpgen.simulator.execute import load_mujoco
+from cnpgen.simulator.plant import Plant, as_plant
+from cnpgen.store.files.documents import canonical_sha256, plain
+
+FASTEST = ("cnp-b", "cnp-b+refine", "solve")  # what runs where nothing else is said: the others take longer
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how many steps it has, and how many of them are done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """What planners did with the problems of a suite.
+
+    Attributes:
+        suite: The suite.
+        problems: Its problems.
+        lead: Of turns, the first motions that lead to them.
+        results: Planner -> its rows, one for each problem, in their order (docs/benchmark.md).
+        plants: The plants that plans were executed on in this run.
+    """
+
+    suite: Suite
+    problems: Plans
+    lead: Lead | None
+    results: dict[str, list[dict[str, Any]]]
+    plants: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
+
+    def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+        """Return ratios, medians, quartiles and p-values of every planner; see ``summarise_results``.
+
+        Args:
+            plant: The plant whose executions count; none by default.
+        """
+        return summarise_results(self.results, plant)
+
+
+def run_benchmark(
+    suite: str | Path | Suite,
+    folder: str | Path,
+    *,
+    planners: Sequence[str] = FASTEST,
+    n: int | None = None,
+    plants: Sequence[str | Plant] = (),
+    time_limit: float = 60.0,
+    workers: int | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Benchmark:
+    """Compare planners; a run that was interrupted goes on where it was.
+
+    Every planner plans for one problem after the other, in a process of its own on one thread: its times are not
+    disturbed by others of the same run. Plans are executed in as many processes as are wanted.
+
+    Args:
+        suite: A suite, or the name or the file of one, or of a dataset.
+        folder: Where results are kept, a file per planner; made if it is not there.
+        planners: Names of planners.
+        n: Only the first so many problems; of a random suite it may be more.
+        plants: Plants that plans are executed on; none by default.
+        time_limit: How long a planner may take for a problem [s]; those that cannot tell the time may take longer.
+        workers: Processes that execute plans; default one per available core.
+        force: Whether results of another suite, version or time limit may be thrown away.
+        progress: Called after every problem.
+
+    Raises:
+        UsageError: There is no such planner or plant, it cannot plan for such problems, or the folder has results of
+            another run.
+        RecipeError: The suite has mistakes.
+        MachineError: MuJoCo is missing, or the results cannot be written.
+    """
+    loaded = suite if isinstance(suite, Suite) else load_suite(suite)
+    _check_planners(planners)
+    robots = tuple(as_plant(plant) for plant in plants)
+    if robots:
+        load_mujoco()
+    limit = number("time_limit", time_limit)
+    if limit <= 0:
+        raise UsageError(f"time_limit must be above 0 s, got {time_limit:g} s")
+    problems, lead = loaded.problems(None if n is None else integer("n", n, least=1))
+    setting = Setting(problems.problem, loaded.model, limit)
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    tell = progress or (lambda *_: None)
+    rows = {}
+    for name in planners:
+        results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), discard=force)
+        _plan_all(results, name, setting, problems, tell)
+        for plant in robots:
+            _execute_all(
+                results, plant, problems, lead, workers=workers, tell=partial(tell, f"{name}, {plant.name} plant")
+            )
+        rows[name] = [results.rows[index] for index in range(len(problems))]
+    return Benchmark(loaded, problems, lead, rows, tuple(plant.name for plant in robots))
+
+
+def _check_planners(planners: Sequence[str]) -> None:
+    """Refuse names before any work."""
+    known = registry.names(registry.PLANNERS)
+    if not planners:
+        raise UsageError(f"no planners, expected some of {', '.join(known)}")
+    for name in planners:
+        if name not in known:
+            raise UsageError(f"unknown planner {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+
+
+def _identity(suite: Suite, planner: str, time_limit: float) -> dict[str, Any]:
+    """Say what distinguishes the results of a planner from others."""
+    digest = canonical_sha256(plain(resolved(suite)))
+    return {
+        "suite": suite.name,
+        "suite_version": suite.version,
+        "suite_sha256": digest,
+        "planner": planner,
+        "cnpgen": __version__,
+        "time_limit_s": time_limit,
+    }
+
+
+def _plan_all(results: Results, name: str, setting: Setting, problems: Plans, tell: Progress) -> None:
+    """Let a planner plan for the problems that have no result yet."""
+    waiting = list(results.missing(len(problems)))
+    if not waiting:
+        return
+    process = PlannerProcess(name, setting)
+    try:
+        for index in waiting:
+            attempt = process.plan(problems[index])
+            results.append(_row(index, problems[index], attempt))
+            tell(f"{name} plans", len(problems), len(problems) - len(waiting) + waiting.index(index) + 1)
+    finally:
+        process.stop()
+
+
+def _row(index: int, problem: Plans, attempt: Attempt) -> dict[str, Any]:
+    """Write down what became of a problem."""
+    row: dict[str, Any] = {
+        "problem": index,
+        "ending": str(attempt.ending),
+        "planning_s": attempt.seconds,
+        "planning_cpu_s": attempt.cpu_seconds,
+        "error": attempt.error,
+        "answer": answer_to_dict(attempt.answer),
+    }
+    if attempt.answer is not None:
+        row["verdict"] = verdict_to_dict(judge_answer(problem, attempt.answer))
+    return row
+
+
+def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
+    """Return what is kept of a verdict: reason, paper's rule, metrics, and the excess of every condition."""
+    excess = {name: margin.severity for name, margin in verdict.margins.items()}
+    return {
+        "valid": verdict.valid,
+        "reason": str(verdict.reason),
+        "paper": asdict(verdict.paper),
+        "metrics": verdict.metrics.to_dict(),
+        "value_over_bound": {
+            name: abs(margin.value) / abs(margin.bound)
+            for name, margin in verdict.margins.items()
+            if margin.bound and np.isfinite(margin.value / margin.bound)
+        },
+        "severity": {name: value for name, value in excess.items() if np.isfinite(value)},
+    }
+
+
+def _execute_all(
+    results: Results,
+    plant: Plant,
+    problems: Plans,
+    lead: Lead | None,
+    *,
+    workers: int | None,
+    tell: Callable[[int, int], None],
+) -> None:
+    """Execute the plans that were not executed on this plant yet."""
+    waiting = list(results.unexecuted(plant.name, len(problems)))
+    if not waiting:
+        return
+    tasks = (_task(problems[index], results.rows[index], lead and lead[index]) for index in waiting)
+    count = worker_count(workers, len(waiting))
+    with closing(share_out(partial(execute_answer, plant=plant), tasks, count, ordered=True)) as found:
+        for done, (index, executed) in enumerate(zip(waiting, found, strict=True), start=1):
+            results.append({"problem": index, "executed": {plant.name: executed.to_dict()}})
+            tell(len(waiting), done)
+
+
+def _task(problem: Plans, row: dict[str, Any], lead: Lead | None) -> Task:
+    return problem, answer_from_dict(problem, row["answer"]), lead

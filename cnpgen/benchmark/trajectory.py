@@ -1,0 +1,72 @@
+"""Trajectories that are sampled in time, as most planners return them, and what lies between two samples."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.trajectory.samples import checked_samples
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion given by samples; between them it is what a controller makes of it.
+
+    With positions alone it is linear between two samples, with velocities a cubic, with accelerations as well a
+    polynomial of the fifth degree: as ROS's joint trajectory controllers do it.
+
+    Attributes:
+        t: Times [s], shape (K,), increasing from 0.
+        q: Joint positions [rad], shape (K, n).
+        dq: Joint velocities [rad/s], shape (K, n), or None.
+        ddq: Joint accelerations [rad/s^2], shape (K, n), or None.
+
+    Raises:
+        UsageError: A shape is wrong, the times do not increase from 0, or something is not finite.
+    """
+
+    t: Array
+    q: Array
+    dq: Array | None = None
+    ddq: Array | None = None
+
+    def __post_init__(self) -> None:
+        checked_samples(self.t, self.q, self.dq)
+        if self.ddq is not None:
+            if self.dq is None:
+                raise UsageError("a trajectory with accelerations needs velocities, too")
+            checked_samples(self.t, self.q, self.ddq)
+        if self.t[0] != 0:
+            raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s")
+
+    @property
+    def duration(self) -> float:
+        """Motion time [s]."""
+        return float(self.t[-1])
+
+    def states(self, t: Array) -> tuple[Array, Array, Array]:
+        """Evaluate it.
+
+        Args:
+            t: Times [s], shape (K,).
+
+        Returns:
+            Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (K, n) each.
+            Accelerations of linear pieces are 0: the jumps of their velocities are not in them.
+        """
+        t = np.clip(t, 0, self.duration)
+        q, dq, ddq = (np.asarray(self._piecewise(t, order)) for order in range(3))
+        return q, dq, ddq
+
+    @cached_property
+    def _piecewise(self) -> Any:
+        """The piecewise polynomial, a function of (t, order of the derivative)."""
+        from scipy.interpolate import BPoly
+
+        parts = [part for part in (self.q, self.dq, self.ddq) if part is not None]
+        return BPoly.from_derivatives(self.t, np.stack(parts, axis=1))

@@ -1,0 +1,136 @@
+"""``cnpgen benchmark``: planners compared on the problems of a suite."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.progress import Meter
+
+if TYPE_CHECKING:
+    from cnpgen.benchmark.run import Benchmark
+
+_TEXT = """\
+Every planner plans for one problem after the other, in a process of its own and on one thread; Pinocchio and Coal judge
+what it returns, and with --simulate MuJoCo executes it. What is finished is written to DIR at once, a file per planner:
+after Ctrl-C, kill -9 or a full disk the same command goes on, and with more --planners or --plant it adds to what is
+there. A planner that crashes, runs out of time or returns garbage costs its own row. docs/benchmark.md says what the
+suites and the planners are. The exit code is 0 if the benchmark is complete, whatever the planners did.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "benchmark", run, title="compare planners on the problems of a suite", text=_TEXT)
+    option = parser.add_argument
+    option("suite", metavar="SUITE", nargs="?", help="a suite, see --list, or a dataset for random problems of it")
+    option("--list", action="store_true", help="list suites, planners and plants")
+    option("-o", "--out", metavar="DIR", type=Path, help="the folder of the results (default: SUITE-results)")
+    option("--planners", metavar="NAME", nargs="+", help="which planners (default: cnp-b cnp-b+refine solve)")
+    option("--n", metavar="N", type=values.positive, help="only the first N problems; of a random suite also more")
+    option("--simulate", action="store_true", help="execute the plans, too")
+    option("--plant", metavar="NAME", nargs="+", help="the robots that execute them (default: nominal)")
+    option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="for each problem (default: 60s)")
+    option(
+        "--workers", metavar="W", type=values.positive, help="processes that execute; default one per available core"
+    )
+    option("--force", action="store_true", help="throw away results of another suite, version or time limit in DIR")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.benchmark.report import save_benchmark_report
+    from cnpgen.errors import UsageError
+
+    if arguments.list:
+        print(_listing(as_json=arguments.json))
+        return 0
+    if arguments.suite is None:
+        raise UsageError("which suite? 'cnpgen benchmark --list' names them")
+    if arguments.plant and not arguments.simulate:
+        raise UsageError("--plant says which robot executes plans: it goes with --simulate only")
+    folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
+    found = _run(arguments, folder)
+    report = save_benchmark_report(found, folder / "report.html")
+    print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
+    print(f"report: {report}", file=sys.stderr)
+    return 0
+
+
+def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
+    from cnpgen.benchmark.run import FASTEST, run_benchmark
+
+    meter, doing = Meter(noun="problem"), [""]
+
+    def progress(what: str, total: int, done: int) -> None:
+        if what != doing[0]:
+            doing[0] = what
+            meter.begin(what, total, done - 1)
+        meter(1)
+
+    try:
+        return run_benchmark(
+            arguments.suite,
+            folder,
+            planners=arguments.planners or FASTEST,
+            n=arguments.n,
+            plants=(arguments.plant or ("nominal",)) if arguments.simulate else (),
+            time_limit=arguments.time_limit,
+            workers=arguments.workers,
+            force=arguments.force,
+            progress=progress,
+        )
+    except KeyboardInterrupt as interruption:
+        kept = f"{folder} keeps what is finished, run the same command again to go on"
+        raise type(interruption)(kept) from interruption
+    finally:
+        meter.close()
+
+
+def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
+    """Return for JSON what is said of all planners."""
+    from cnpgen.benchmark.results import FORMAT, FORMAT_VERSION
+
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "suite": found.suite.name,
+        "suite_version": found.suite.version,
+        "problems": len(found.problems),
+        "folder": str(folder),
+        "planners": {plant or "planned": found.summary(plant) for plant in found.plants or ("",)},
+    }
+
+
+def _text(found: "Benchmark") -> str:
+    """Lay out a table per plant, a column per planner."""
+    from cnpgen.benchmark.report import table_rows
+    from cnpgen.cli.describe import table
+
+    head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
+    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.plants or ("",)]
+    return "\n\n".join([head, *("\n".join(lines) for lines in tables)])
+
+
+def _listing(*, as_json: bool) -> str:
+    """List what there is to compare, and on what."""
+    from cnpgen.benchmark.suite import list_suites, load_suite
+    from cnpgen.cli.describe import kind_summary, table
+    from cnpgen.schema import registry
+    from cnpgen.simulator.plant import PLANTS
+
+    planners = {
+        name: kind_summary(registry.load(registry.PLANNERS, name)) for name in registry.names(registry.PLANNERS)
+    }
+    found = {
+        "suites": {name: load_suite(name).title for name in list_suites()},
+        "planners": planners,
+        "plants": {plant.name: plant.title for plant in PLANTS.values()},
+    }
+    if as_json:
+        return json.dumps(found, indent=2)
+    return "\n\n".join("\n".join([what, *table(list(names.items()), indent="  ")]) for what, names in found.items())

@@ -1,0 +1,82 @@
+"""``cnpgen complete``: boundary problems from tasks in the workspace."""
+
+import argparse
+import json
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.plan_files import check_suffix
+
+if TYPE_CHECKING:
+    from cnpgen.make.complete import Completed
+
+NAMED = 10  # tasks without an answer, by number
+
+_TEXT = """\
+The stages of the pipeline find, in their order, what tasks do not give: 'goal_xyz.x,goal_xyz.y,hit_angle' is enough to
+hit a puck. Columns are those of datasets, components after a dot, numbers in SI. The start is given by joints
+(start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); if nothing of it is given it is the problem's base at
+rest. A hit is as fast as possible unless hit_speed [m/s] or hit_speed_share says otherwise. docs/tasks.md has examples.
+What 'cnpgen solve', 'refine' and 'plan' make plans for is written to OUT, which is printed on stdout; sample_id says
+which task each problem is. Tasks that have no answer are left out, with the reason on stderr; the exit code is 1 if no
+task has one.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(
+        commands, "complete", run, title="make boundary problems of tasks in the workspace", text=_TEXT
+    )
+    option = parser.add_argument
+    option("pipeline", metavar="NAME|FILE", help="a pipeline or dataset by name, or a recipe file")
+    option("tasks", metavar="TASKS", type=Path, help="a table of tasks: CSV, or HDF5")
+    option("-o", "--out", metavar="OUT", type=Path, required=True, help="where the boundary problems go, .h5")
+    option("--force", action="store_true", help="replace OUT")
+    option("--quiet", action="store_true", help="no summary")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.cli.recipe_names import check_recipe, check_there
+    from cnpgen.cli.refine_options import check_place
+    from cnpgen.make.complete import complete_table
+    from cnpgen.plans import save_plans
+
+    check_there(arguments.pipeline)
+    check_recipe(arguments.pipeline)
+    check_suffix(arguments.out)
+    check_place(arguments.out, force=arguments.force)
+    found = complete_table(arguments.pipeline, arguments.tasks)
+    if len(found.plans):
+        save_plans(arguments.out, found.plans)
+    if not arguments.quiet:
+        print("\n".join(_summary(found)), file=sys.stderr)
+    if arguments.json:
+        print(json.dumps(_facts(found, arguments.out), indent=2))
+    elif len(found.plans):
+        print(arguments.out)
+    return 0 if len(found.plans) else 1
+
+
+def _facts(found: "Completed", out: Path) -> dict[str, object]:
+    rejected = [{"task": task, "reason": reason} for task, reason in enumerate(found.reasons) if reason]
+    written = str(out) if len(found.plans) else None
+    return {"file": written, "tasks": len(found.reasons), "completed": len(found.plans), "without_answer": rejected}
+
+
+def _summary(found: "Completed") -> list[str]:
+    """Say in a few lines how many tasks have an answer, and why the others have none."""
+    from cnpgen.errors import counted
+
+    lines = [f"{len(found.plans):,} of {counted(len(found.reasons), 'task')} completed"]
+    for reason, count in found.rejections.items():
+        which = [task for task, why in enumerate(found.reasons) if why == reason][:NAMED]
+        more = f" and {count - NAMED:,} more" if count > NAMED else ""
+        named = f"task{'s' * (count > 1)} {', '.join(map(str, which))}{more}"
+        lines += textwrap.wrap(f"  {count:,} {reason}: {named}", 110, subsequent_indent="    ")
+    return lines

@@ -1,0 +1,138 @@
+"""``cnpgen simulate``: execute the plans of a file in MuJoCo."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.plan_files import read_plans
+from cnpgen.cli.progress import Meter
+
+if TYPE_CHECKING:
+    from cnpgen.plans import Plans
+    from cnpgen.simulator.simulate import Simulation
+
+PLANTS = ("nominal", "heavier", "delayed")
+
+_TEXT = """\
+Every plan is executed for itself, by computed torque at 1 kHz, on a robot with friction that its controller does not
+know. On a table, a plan that ends in motion is a hit: the puck lies 7 cm ahead of where it ends. docs/benchmark.md says
+what is simulated and what is counted. The exit code is 0 if every plan does its task (scores without touching the puck
+early, or reaches its goal without collision), and 1 if any does not.
+"""
+_NAMES = {
+    "success": "success",
+    "finished": "at the goal at the end of the plan",
+    "hit": "hit the puck",
+    "scored": "scored",
+    "touched_early": "touched the puck early",
+    "collided": "collided",
+}
+_FIGURES = {
+    "hit_time_s": ("time to hit [s]", "{:.3f}"),
+    "puck_speed_m_s": ("puck speed [m/s]", "{:.2f}"),
+    "z_error_mm_s": ("z error, executed [mm s]", "{:.3f}"),
+    "vertical_error_rad_s": ("vertical error, executed [rad s]", "{:.4f}"),
+    "tracking_error_rad_s": ("tracking error [rad s]", "{:.4f}"),
+    "torque_use": ("largest torque / rated", "{:.2f}"),
+}
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "simulate", run, title="execute the plans of a file in MuJoCo", text=_TEXT)
+    option = parser.add_argument
+    option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
+    option("--problem", metavar="NAME|FILE", help="the problem that they must be for")
+    option("--plant", choices=PLANTS, default="nominal", help=f"the robot: {', '.join(PLANTS)} (default: nominal)")
+    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    option("--list", action="store_true", help="list the plans, too: a line each")
+    option("--plan", metavar="I", type=values.natural, default=0, help="the plan to draw (default: 0)")
+    option("--image", metavar="PICTURE", type=_picture, help="draw the world at the end of one plan: .png")
+    option("--video", metavar="FILM", type=_film, help="film one plan: .mp4 or .gif")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.errors import UsageError
+    from cnpgen.simulator.simulate import simulate_plans
+
+    plans = read_plans(arguments.file, problem=arguments.problem)
+    if arguments.plan >= len(plans):
+        raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
+    meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
+    meter.begin(f"executing {arguments.file}", len(plans))
+    try:
+        found = simulate_plans(plans, plant=arguments.plant, workers=arguments.workers, progress=meter)
+    finally:
+        meter.close()
+    if arguments.json:
+        rows = [{"plan": index, **each.to_dict()} for index, each in enumerate(found.executed)]
+        print(json.dumps({"file": str(arguments.file), **found.summary(), "executed": rows}, indent=2))
+    else:
+        print(_text(arguments.file, found))
+        if arguments.list:
+            print("\n" + "\n".join(_lines(found)))
+    _draw(arguments, plans[arguments.plan])
+    return 0 if all(each.success for each in found.executed) else 1
+
+
+def _text(file: Path, found: "Simulation") -> str:
+    """Lay out what came of all plans together."""
+    from cnpgen.cli.describe import table
+    from cnpgen.errors import counted
+
+    summary, count = found.summary(), len(found.executed)
+    head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
+    tallies = [
+        (text, f"{summary[name]:,} of {count:,}", f"{summary[name] / count:.2%}")
+        for name, text in _NAMES.items()
+        if name in summary
+    ]
+    figures = [
+        (text, form.format(summary["medians"][name]))
+        for name, (text, form) in _FIGURES.items()
+        if name in summary["medians"]
+    ]
+    lines = [head, "", *table(tallies, indent="  ", right=(1, 2)), "", "  medians", *table(figures, indent="    ")]
+    refused = [(index, each.failure) for index, each in enumerate(found.executed) if each.failure]
+    return "\n".join(lines + [f"  plan {index} was not executed: {why}" for index, why in refused])
+
+
+def _lines(found: "Simulation") -> list[str]:
+    """List the plans."""
+    lines = []
+    for index, each in enumerate(found.executed):
+        row = each.to_dict()
+        flags = [text for name, text in _NAMES.items() if row.get(name) is True]
+        figures = [f"{text} {form.format(row[name])}" for name, (text, form) in _FIGURES.items() if name in row]
+        lines.append(f"plan {index}: {'; '.join([*flags, *figures]) or each.failure}")
+    return lines
+
+
+def _draw(arguments: argparse.Namespace, plan: "Plans") -> None:
+    from cnpgen.simulator.picture import save_film, save_picture
+    from cnpgen.simulator.plant import as_plant
+    from cnpgen.simulator.simulate import execute_plan
+
+    if not (arguments.image or arguments.video):
+        return
+    scene, reference, execution = execute_plan(plan, as_plant(arguments.plant))
+    if arguments.image:
+        save_picture(Path(arguments.image), scene, execution, reference.ticks)
+        print(f"drawn: plan {arguments.plan} in {arguments.image}", file=sys.stderr)
+    if arguments.video:
+        save_film(Path(arguments.video), scene, execution, reference.ticks)
+        print(f"filmed: plan {arguments.plan} in {arguments.video}", file=sys.stderr)
+
+
+def _picture(text: str) -> str:
+    return values.picture_file(text, ".png")
+
+
+def _film(text: str) -> str:
+    return values.picture_file(text, ".mp4", ".gif")

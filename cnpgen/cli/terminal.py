@@ -1,0 +1,53 @@
+r"""The one place through which a command prints: what strangers wrote must not steer the terminal that shows it.
+
+Titles of recipes, names of fields and joints, texts in files of plans: any of them may hold the control characters by
+which a terminal is told to move, to colour, to rename its window, or the marks that turn the direction of writing. They
+are printed as ``\u001b``, as JSON has them, so that output which is JSON stays the same JSON.
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+# What is not printed: control characters but newline and tab, and marks of direction (Unicode, bidirectional controls).
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    r"""Write the control characters of a text as ``\u001b``."""
+    return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+class Printable:
+    """A stream that prints what is printable.
+
+    Args:
+        stream: Where it goes.
+
+    Attributes:
+        terminal: The stream itself, for bars of progress, which move on a line.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.terminal = stream
+
+    def write(self, text: str) -> int:
+        """Write a text."""
+        self.terminal.write(printable(text))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.terminal, name)
+
+
+@contextmanager
+def printing_safely() -> Iterator[None]:
+    """Let stdout and stderr show only what is printable, as long as the block lasts."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (Printable(stream) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before

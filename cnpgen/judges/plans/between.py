@@ -1,0 +1,152 @@
+"""The largest value of a joint's position, velocity and acceleration over a whole motion, between any two moments.
+
+Between knots they are polynomials in s: q of degree D, dq = p' r of degree 2 D - 1 and ddq = (p'' r + p' r') r of
+degree 3 D - 2. A polynomial in Bernstein form lies between its least and its largest coefficient, and halving its
+interval brings those closer by a factor of four: halving wherever the largest value could still be proves where it is.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline import derivative
+
+Array = NDArray[np.float64]
+
+CLOSE = 1e-6  # how far below the largest value the one that is found may be, where that decides whether it is above 1
+ROUGH = 1e-3  # the same elsewhere
+HALVINGS = 40  # at most: pieces are then shorter than a picosecond
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Joint positions and their derivatives in time as polynomials between knots, in Bernstein form.
+
+    Attributes:
+        edges: Phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,).
+        q: Coefficients [rad], shape (n, S, D + 1).
+        dq: Coefficients [rad/s], shape (n, S, 2 D).
+        ddq: Coefficients [rad/s^2], shape (n, S, 3 D - 1).
+    """
+
+    edges: Array
+    q: Array
+    dq: Array
+    ddq: Array
+
+
+def polynomials(motion: Motion) -> Pieces:
+    """Return the polynomials of one motion."""
+    degree = motion.degree
+    degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
+    edges = _edges(len(path), len(rate), degree)
+    p, p1, p2 = (_in_bernstein_form(path, degree, order, edges) for order in range(3))
+    r, r1 = (_in_bernstein_form(rate, degree, order, edges) for order in range(2))
+    return Pieces(edges, q=p, dq=_product(p1, r), ddq=_product(_product(p2, r) + _product(p1, r1), r))
+
+
+def largest(rows: Array, edges: Array) -> tuple[float, int, float]:
+    """Find the largest value of piecewise polynomials to within ``ROUGH``, and whether it is above 1 to ``CLOSE``.
+
+    Args:
+        rows: Bernstein coefficients of M functions, finite, shape (M, S, d + 1).
+        edges: Phases between which they are polynomials, shape (S + 1,).
+
+    Returns:
+        ``(value, row, s)``: the largest value that is attained, of which function, at which phase.
+    """
+    count, spans, size = rows.shape
+    pieces = rows.reshape(-1, size)
+    of_row = np.repeat(np.arange(count), spans)
+    left, width = np.tile(edges[:-1], count), np.tile(np.diff(edges), count)
+    best, at = -np.inf, (0, 0.0)
+    for _ in range(HALVINGS):
+        for k, s in ((0, left), (-1, left + width)):
+            top = int(np.argmax(pieces[:, k]))
+            if pieces[top, k] > best:
+                best, at = float(pieces[top, k]), (int(of_row[top]), float(s[top]))
+        hull = pieces.max(axis=1)
+        open_ = hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH)
+        if not open_.any():
+            break
+        pieces, of_row, left, width = pieces[open_], of_row[open_], left[open_], width[open_] / 2
+        first, second = _halving(size)
+        pieces = np.concatenate([pieces @ first, pieces @ second])
+        of_row, left, width = np.tile(of_row, 2), np.concatenate([left, left + width]), np.tile(width, 2)
+    return best, *at
+
+
+@cache
+def _edges(path_points: int, rate_points: int, degree: int) -> Array:
+    """Return the knots of both splines."""
+    spans = (path_points - degree, rate_points - degree)
+    knots = {round(k / count, 12): k / count for count in spans for k in range(count + 1)}
+    return np.array([knots[key] for key in sorted(knots)])
+
+
+def _in_bernstein_form(control: Array, degree: int, order: int, edges: Array) -> Array:
+    """Return a derivative of splines between edges, shape (n, S, D - order + 1); ``control`` has shape (C, n)."""
+    matrix = _to_bernstein_form(len(control), degree, order, tuple(edges.tolist()))
+    pieces = (matrix @ control).reshape(len(edges) - 1, degree - order + 1, -1)
+    return np.ascontiguousarray(pieces.transpose(2, 0, 1))
+
+
+@cache
+def _to_bernstein_form(points: int, degree: int, order: int, edges: tuple[float, ...]) -> Array:
+    """Return the matrix from control points to a derivative's Bernstein coefficients, shape (S (D - order + 1), C).
+
+    The coefficients between a and b are the values of the derivative's polar form, at arguments of which ever more are
+    b instead of a (Ramshaw, "Blossoms are polar forms", 1989).
+    """
+    knots, matrix = derivative(points, degree, order)
+    degree -= order
+    rows = []
+    for low, high in pairwise(edges):
+        last = int(np.searchsorted(knots, (low + high) / 2)) - 1
+        rows += [_polar(knots, last, [low] * (degree - k) + [high] * k) for k in range(degree + 1)]
+    return np.asarray(np.array(rows) @ matrix)
+
+
+def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
+    """Return what every control point contributes to a polar form, by de Boor's recursion, shape (C,).
+
+    Args:
+        knots: Knots.
+        last: Index of the last control point that counts between these knots.
+        arguments: Phases, as many as the degree.
+    """
+    degree = len(arguments)
+    worth = np.eye(len(knots) - degree - 1)[last - degree : last + 1]
+    for p, s in enumerate(arguments, start=1):
+        k = np.arange(last - degree + p, last + 1)
+        share = ((s - knots[k]) / (knots[k + degree - p + 1] - knots[k]))[:, None]
+        worth = (1 - share) * worth[:-1] + share * worth[1:]
+    return np.asarray(worth[0])
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Multiply functions (n, S, i + 1) by one function (1, S, j + 1), piece by piece."""
+    outer = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:-1], -1)
+    return np.asarray(outer @ _products(a.shape[-1] - 1, b.shape[-1] - 1))
+
+
+@cache
+def _products(i: int, j: int) -> Array:
+    """Return the matrix from products of coefficients to coefficients of the product, shape ((i+1) (j+1), i+j+1)."""
+    matrix = np.zeros((i + 1, j + 1, i + j + 1))
+    for k in range(i + 1):
+        for m in range(j + 1):
+            matrix[k, m, k + m] = comb(i, k) * comb(j, m) / comb(i + j, k + m)
+    return matrix.reshape(-1, i + j + 1)
+
+
+@cache
+def _halving(size: int) -> tuple[Array, Array]:
+    """Return de Casteljau's matrices at the middle: ``coefficients @ first`` are those of the first half."""
+    first = np.array([[comb(k, m) / 2**k for k in range(size)] for m in range(size)])
+    return first, np.ascontiguousarray(first[::-1, ::-1])

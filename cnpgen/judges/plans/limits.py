@@ -1,0 +1,62 @@
+"""Joint limits over a whole motion, between any two moments: proven, since there the motion is a polynomial."""
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.between import Pieces, largest
+from cnpgen.judges.plans.sampling import table_phases
+from cnpgen.judges.plans.verdict import Margin
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointVelocity
+from cnpgen.world.path import PathWorld
+
+if TYPE_CHECKING:
+    from cnpgen.world.state import World
+
+Array = NDArray[np.float64]
+
+LEAST = 1e-9  # of a bound: how exactly the largest excess is found where none is allowed
+_COEFFICIENTS = {JointPosition: "q", JointVelocity: "dq", JointAcceleration: "ddq"}
+
+
+def is_proven(constraint: Constraint) -> bool:
+    """Whether a constraint is a limit that can be proven to hold at every moment."""
+    return type(constraint) in _COEFFICIENTS
+
+
+def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, table: Array) -> Margin:
+    """Find where a motion comes closest to breaking a joint limit, or breaks it most.
+
+    Args:
+        constraint: One that ``is_proven``.
+        world: The robot at the samples.
+        pieces: The motion as polynomials.
+        table: Times of the motion at ``table_phases()`` [s].
+    """
+    (condition,) = constraint.measured(cast("World", world))
+    allowed = constraint.allowed(condition)
+    scale = np.maximum(allowed, LEAST * np.maximum(np.abs(condition.lower), np.abs(condition.upper)))
+    coefficients: Array = getattr(pieces, _COEFFICIENTS[type(constraint)])
+    share, row, s = largest(_beyond(coefficients, condition, scale), pieces.edges)
+    low, part = row < len(scale), row % len(scale)
+    excess, bound = share * scale[part], (condition.lower if low else condition.upper)[part]
+    return Margin(
+        condition.name,
+        constraint.reason,
+        condition.unit,
+        world.robot.joint_names[part],
+        value=float(bound - excess if low else bound + excess),
+        bound=float(bound),
+        excess=float(excess),
+        allowed=float(allowed[part]),
+        time=float(np.interp(s, table_phases(), table)),
+        phase=s,
+    )
+
+
+def _beyond(coefficients: Array, condition: Condition, scale: Array) -> Array:
+    """Return how far joints are below their lower bounds, then above their upper ones, in multiples of ``scale``."""
+    lower, upper, unit = (values[:, None, None] for values in (condition.lower, condition.upper, scale))
+    return np.concatenate([(lower - coefficients) / unit, (coefficients - upper) / unit])

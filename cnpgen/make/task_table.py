@@ -1,0 +1,113 @@
+"""Tables of tasks: CSV or HDF5 with the columns of datasets, components after a dot: ``goal_xyz.x``, ``hit_angle``."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, MachineError, UsageError, nearest
+from cnpgen.schema.arguments import numbers
+from cnpgen.store.field import Field
+from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.kind import HDF5
+from cnpgen.store.paths import require_file
+
+Array = NDArray[np.float64]
+
+
+def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
+    """Read tasks from a table.
+
+    Args:
+        path: A table of CSV, whose first line names the columns, or a file of HDF5, whose datasets are columns, or
+            whole fields of shape (N, width). Numbers are in SI.
+        fields: What tasks may give: name -> field.
+
+    Returns:
+        Name -> values, shape (N,) or (N, width); of a position without its z, shape (N, 2).
+
+    Raises:
+        UsageError: There is no such file.
+        DatasetError: It is damaged, or has a column that no task can give, or something that is no number.
+        MachineError: The system would not let us read it.
+    """
+    require_file(path, "a table of tasks, CSV or HDF5")
+    columns = _hdf5_columns(path) if _is_hdf5(path) else _csv_columns(path)
+    known = {**fields, **{column: field for field in fields.values() for column in field.columns}}
+    for name, values in columns.items():
+        if name not in known:
+            raise DatasetError(_unknown(path, name, fields))
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
+            raise DatasetError(f"{path}: {name} must be a finite number in every task, got {values[row]} in task {row}")
+    found = {name: values for name, values in columns.items() if name in fields}
+    for field in fields.values():
+        parts = [column for column in field.columns if field.width and column in columns]
+        if parts:
+            found[field.name] = _joined(path, field, parts, columns)
+    return found
+
+
+def _unknown(path: Path, name: str, fields: Mapping[str, Field]) -> str:
+    hint = nearest(name, [column for field in fields.values() for column in field.columns])
+    return f"{path}: tasks of this pipeline cannot give {name!r}{hint or ', only ' + ', '.join(fields)}"
+
+
+def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array]) -> Array:
+    """Join the components of a field; a position on a table needs no height."""
+    missing = [column for column in field.columns if column not in parts]
+    if missing and not (field.name.endswith("_xyz") and missing == [f"{field.name}.z"]):
+        raise DatasetError(f"{path} lacks {', '.join(missing)} beside {', '.join(parts)}")
+    return np.stack([columns[name] for name in parts], axis=1)
+
+
+def _is_hdf5(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(HDF5)) == HDF5
+    except OSError as error:
+        raise MachineError(f"{path}: {error.strerror or error}") from error
+
+
+def _hdf5_columns(path: Path) -> dict[str, Array]:
+    with opened_hdf5(path) as file:
+        found = {name: column.read() for name, column in file.columns().items()}
+    try:
+        columns: dict[str, Array] = {name: numbers(name, values) for name, values in found.items()}
+    except UsageError as error:
+        raise DatasetError(f"{path}: {error}") from error
+    if len({len(values) if values.ndim else -1 for values in columns.values()}) > 1:
+        shapes = ", ".join(f"{name} {values.shape}" for name, values in columns.items())
+        raise DatasetError(f"{path}: columns must have one value per task each, got {shapes}")
+    return columns
+
+
+def _csv_columns(path: Path) -> dict[str, Array]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DatasetError(f"{path} is no table of CSV in UTF-8: {error}") from error
+    except OSError as error:
+        raise MachineError(f"{path}: {error.strerror or error}") from error
+    if not lines:
+        raise DatasetError(f"{path} is empty: its first line must name columns, such as goal_xyz.x,goal_xyz.y")
+    names = [cell.strip() for cell in lines[0][1]]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
+    table = np.array([_numbers_of(path, number, row, names) for number, row in lines[1:]])
+    return dict(zip(names, table.reshape(-1, len(names)).T, strict=True))
+
+
+def _numbers_of(path: Path, line: int, row: list[str], names: list[str]) -> list[float]:
+    if len(row) != len(names):
+        raise DatasetError(f"{path}: line {line} has {len(row)} values, the first line names {len(names)} columns")
+    found = []
+    for name, cell in zip(names, row, strict=True):
+        try:
+            found.append(float(cell))
+        except ValueError as error:
+            raise DatasetError(f"{path}: line {line}: {name} must be a number, got {cell.strip()!r}") from error
+    return found

@@ -1,0 +1,98 @@
+"""Joining plans: what is executed when a plan is cut at a moment, and another goes on from there."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.status import PlanStatus
+from cnpgen.problems.record import ProblemRecord
+from cnpgen.schema.arguments import numbers
+from cnpgen.trajectory.joined import JoinedMotion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedPlans:
+    """N sequences of plans, as they are executed; ``export_plans`` takes them as it takes plans.
+
+    Attributes:
+        parts: The plans, N each, in the order of their execution.
+        begins: When each of them takes over, since the start of the first [s], shape (parts, N).
+    """
+
+    parts: tuple[Plans, ...]
+    begins: Array
+
+    def __len__(self) -> int:
+        return len(self.parts[0])
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} sequences of {len(self.parts)} plans of {self.problem.name!r}>"
+
+    @property
+    def problem(self) -> ProblemRecord:
+        """The problem of all of them."""
+        return self.parts[0].problem
+
+    @property
+    def sample_id(self) -> NDArray[np.int64]:
+        """Which samples the first plans are for, shape (N,)."""
+        return self.parts[0].sample_id
+
+    @property
+    def status(self) -> NDArray[np.uint8]:
+        """What is known of each sequence: valid where all of its plans are, not valid where one is not; shape (N,)."""
+        status = np.array([part.status for part in self.parts])
+        known = np.where((status == PlanStatus.VALID).all(axis=0), PlanStatus.VALID, PlanStatus.UNKNOWN)
+        return np.where((status == PlanStatus.INVALID).any(axis=0), PlanStatus.INVALID, known).astype(np.uint8)
+
+    @cached_property
+    def motion(self) -> JoinedMotion:
+        """The N motions."""
+        return JoinedMotion(tuple(part.motion for part in self.parts), self.begins)
+
+    @cached_property
+    def duration(self) -> Array:
+        """Duration of every sequence [s], shape (N,)."""
+        return self.motion.duration()
+
+
+def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | None = None) -> JoinedPlans:
+    """Cut each of N plans at a moment and join it with the plan that follows it.
+
+    Positions, velocities and accelerations go on without a jump, to 1e-9 in SI units: as they do where ``following``
+    was planned from the state at that moment (``Planner.replan``, ``Planner.strike``, ``refine_plans``).
+
+    Args:
+        first: N plans, or what was joined before.
+        following: N plans, each of which begins where one is cut.
+        at: When they take over, since the start of the first [s], one number or shape (N,); by default at the end.
+
+    Raises:
+        UsageError: There are not as many plans or times, they are of different problems, a time is not within its plan,
+            or there is a jump; the message says how large it is.
+    """
+    joined = first if isinstance(first, JoinedPlans) else _alone(first)
+    check_plans_type(following)
+    if len(following) != len(joined):
+        raise UsageError(f"{len(joined)} plans are followed by {len(following)}, expected one for each")
+    if following.problem.comparable_sha256 != joined.problem.comparable_sha256:
+        differs = ", ".join(following.problem.differences(joined.problem)[:4])
+        raise UsageError(f"plans of {joined.problem.name!r} and {following.problem.name!r} differ in {differs}")
+    try:
+        begins = joined.duration if at is None else np.broadcast_to(numbers("at", at), (len(joined),))
+    except ValueError as error:
+        raise UsageError(f"at must be one number or one for each of {len(joined)} plans, got {at!r:.60}") from error
+    found = JoinedPlans((*joined.parts, following), np.concatenate([joined.begins, begins[None]]))
+    _ = found.motion  # refuses gaps
+    return found
+
+
+def _alone(plans: Plans) -> JoinedPlans:
+    check_plans_type(plans)
+    return JoinedPlans((plans,), np.zeros((1, len(plans))))

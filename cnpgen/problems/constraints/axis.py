@@ -1,0 +1,123 @@
+"""An axis of the tip along a direction of the world, or within an angle of it."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.tip_manifold import along, beside, unit
+from cnpgen.schema.keys import field
+
+if TYPE_CHECKING:
+    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.world.state import World
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TipAxis(Constraint):
+    """The tip's axis a held along the world's direction d: ``e1 . R a = e2 . R a = 0`` and ``d . R a > 0``.
+
+    e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution, and these two are the tilt [rad] to
+    first order.
+    """
+
+    @property
+    @abstractmethod
+    def directions(self) -> tuple[Array, Array]:
+        """The axis in the tip's frame and the direction in the world, unit vectors."""
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the tilt [rad]."""
+        return self._held(state.kinematics.rotation)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate the tilt of Pinocchio's tip frame [rad]."""
+        return self._held(list(world.tip_rotation))
+
+    def _held(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
+        axis, direction = self.directions
+        pointing = [along(axis, row) for row in rotation]
+        tilt = [along(row, pointing) for row in beside(direction)]
+        upright = [along(direction, pointing)]
+        return (
+            Condition("tilt", "rad", tilt, np.zeros(2), np.zeros(2), "angle", ("x", "y")),
+            Condition("upright", "1", upright, np.zeros(1), np.full(1, np.inf), "angle"),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis(TipAxis):
+    """The tip's axis within an angle of a direction; with no angle it is held along it, and at the ends it rests."""
+
+    reason = "tool tilted"
+    axis: Vector = field("the axis in the tip's frame, of any length", default=(0.0, 0.0, 1.0))
+    direction: Vector = field("the direction in the world, of any length", default=(0.0, 0.0, 1.0))
+    angle: float = field("how far the axis may be from the direction", unit="rad", default=0.0, low=0.0, high=1.5)
+    tolerance: float = field("how much further a motion may tilt and still be called valid", unit="rad", low=1e-9)
+
+    def __post_init__(self) -> None:
+        """Check that both directions are some.
+
+        Raises:
+            ValueError: They are not.
+        """
+        unit(self.axis, "axis")
+        unit(self.direction, "direction")
+
+    @property
+    def directions(self) -> tuple[Array, Array]:
+        """The axis in the tip's frame and the direction in the world, unit vectors."""
+        return unit(self.axis, "axis"), unit(self.direction, "direction")
+
+    def allowed(self, condition: Condition) -> Array:
+        """Return how far a motion may be outside: the cosine's share of the tolerance where there is an angle."""
+        if not self.angle:
+            return super().allowed(condition)
+        return np.full(len(condition.g), np.cos(self.angle) - np.cos(min(self.angle + self.tolerance, np.pi)))
+
+    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
+        """State the tilt, and that the axis rests, if it is held."""
+        found = super().symbolic_at(state, end)
+        if self.angle:
+            return found
+        turning = state.tip_angular_velocity, state.tip_angular_acceleration
+        return (*found, *self._resting(state.kinematics.rotation, *turning))
+
+    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
+        """Evaluate the tilt, and whether the axis rests, if it is held."""
+        found = super().measured_at(world, end)
+        if self.angle:
+            return found
+        turning = list(world.tip_angular_velocity), list(world.tip_angular_acceleration)
+        return (*found, *self._resting(list(world.tip_rotation), *turning))
+
+    def _held(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
+        if not self.angle:
+            return super()._held(rotation)
+        axis, direction = self.directions
+        cosine = [along(direction, [along(axis, row) for row in rotation])]
+        bounds = np.full(1, np.cos(self.angle)), np.full(1, np.inf)
+        return (Condition("tilt cosine", "1", cosine, *bounds, "angle"),)
+
+    def _resting(self, rotation: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
+        """Return how fast the axis u turns away from the direction: ``w x u`` and ``a x u + w x (w x u)`` across it."""
+        axis, direction = self.directions
+        u = [along(axis, row) for row in rotation]
+        rate = _cross(omega, u)
+        second = [a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)]
+        zero, rows = np.zeros(2), beside(direction)
+        return (
+            Condition("tilt rate", "rad/s", [along(row, rate) for row in rows], zero, zero, "velocity"),
+            Condition("tilt acceleration", "rad/s^2", [along(row, second) for row in rows], zero, zero, "acceleration"),
+        )
+
+
+def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

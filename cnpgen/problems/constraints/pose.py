@@ -1,0 +1,96 @@
+"""The tip in one orientation, and where it may be: a task space region (Berenson, 2011) that does not turn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.constraint import Condition, End
+from cnpgen.problems.constraints.tip_manifold import Place, TipManifold
+from cnpgen.schema.keys import Range, field
+
+if TYPE_CHECKING:
+    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.world.state import World
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose(TipManifold):
+    """``R = R_wanted`` for the tip, in a box of the world; at the ends it does not turn.
+
+    Where a range is a single point, that coordinate is held. The three values of the orientation are the axis times the
+    sine of the angle of ``R_wanted^T R``: angles [rad] to first order, and 0 at half a turn, too, which is excluded.
+    """
+
+    reason = "not in its pose"
+    inside_name, held_name = "pose box", "pose position"
+    velocity_name, acceleration_name = "velocity out of the pose", "acceleration out of the pose"
+    rpy: tuple[float, float, float] = field("orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad")
+    x: Range | None = field("where the tip may be along world x", unit="m", default=None)
+    y: Range | None = field("where the tip may be along world y", unit="m", default=None)
+    z: Range | None = field("where the tip may be along world z", unit="m", default=None)
+    tolerance: float = field("how far a motion may turn [rad] or be off [m] and still be called valid", low=1e-9)
+
+    @property
+    def place(self) -> Place:
+        """The box, and in which directions it has no width."""
+        given = [(row, each) for row, each in zip(np.eye(3), (self.x, self.y, self.z), strict=True) if each]
+        held = [(row, each.low) for row, each in given if each.low == each.high]
+        free = [(row, each) for row, each in given if each.low < each.high]
+        point = sum((row * value for row, value in held), start=np.zeros(3))
+        rows = [np.array([row for row, _ in given]).reshape(-1, 3) for given in (held, free)]
+        return Place(point, held=rows[0], bounded=rows[1], ranges=tuple(each for _, each in free))
+
+    @property
+    def rotation(self) -> Array:
+        """The wanted rotation, shape (3, 3)."""
+        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
+        roll, pitch, yaw = (
+            np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]),
+            np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]),
+            np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]),
+        )
+        return np.asarray(yaw @ pitch @ roll)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State position [m] and orientation [rad]."""
+        return (*super().symbolic(state), *self._turned(state.kinematics.rotation))
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate Pinocchio's tip frame."""
+        return (*super().measured(world), *self._turned(list(world.tip_rotation)))
+
+    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """State position, orientation and their rates."""
+        moving = self._moving(state.tip_velocity, state.tip_acceleration)
+        turning = _turning(state.tip_angular_velocity, state.tip_angular_acceleration)
+        return (*self.symbolic(state), *moving, *turning)
+
+    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """Evaluate position, orientation and their rates with Pinocchio."""
+        moving = self._moving(list(world.tip_velocity), list(world.tip_acceleration))
+        turning = _turning(list(world.tip_angular_velocity), list(world.tip_angular_acceleration))
+        return (*self.measured(world), *moving, *turning)
+
+    def _turned(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
+        wanted = self.rotation
+        relative = [[sum(float(wanted[k, i]) * rotation[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+        sine = [(relative[i][j] - relative[j][i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))]
+        cosine = (relative[0][0] + relative[1][1] + relative[2][2] - 1) / 2
+        return (
+            Condition("orientation", "rad", sine, np.zeros(3), np.zeros(3), "angle", ("x", "y", "z")),
+            Condition("less than a quarter turn", "1", [cosine], np.zeros(1), np.full(1, np.inf), "angle"),
+        )
+
+
+def _turning(omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
+    """State that the tip does not turn, nor begin to."""
+    zero = np.zeros(3)
+    return (
+        Condition("turning", "rad/s", list(omega), zero, zero, "velocity", ("x", "y", "z")),
+        Condition("turning acceleration", "rad/s^2", list(alpha), zero, zero, "acceleration", ("x", "y", "z")),
+    )

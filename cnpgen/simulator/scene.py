@@ -1,0 +1,200 @@
+"""The simulated world as MuJoCo's own format: the arm from the problem's URDF, and what stands around it.
+
+Nothing collides unless it is named in a pair: the mallet with the puck, the puck with the bands, the held object and
+the arm's links with the obstacles. The table carries the puck, which moves in its plane only; it does not carry the
+mallet, so that every millimetre that the controller is off its height is seen.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.chain import Joint
+from cnpgen.robots.robot import Robot
+from cnpgen.simulator import hockey
+from cnpgen.simulator.plant import Plant, joint_friction
+
+Array = NDArray[np.float64]
+
+STEP = 2.5e-4  # s: four to a tick of the controller
+LINK_RADIUS = 0.07  # m: of the iiwa's links, about; plans keep twice as far away
+PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
+SHORTEST = 1e-3  # m: links that are shorter have no shape; the first one, which only turns, collides with nothing
+DEEP = 5.0  # m: how far obstacles reach down that have no lower end
+_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # object and pedestals press, they do not bounce
+_RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
+    "left": (hockey.HOME + hockey.LENGTH / 2, hockey.WIDTH / 2 + hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
+    "right": (hockey.HOME + hockey.LENGTH / 2, -hockey.WIDTH / 2 - hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
+    **{
+        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH + hockey.WIDTH) / 4, hockey.BAND, half)
+        for end, x in (("home", hockey.HOME - hockey.BAND), ("far", hockey.FAR + hockey.BAND))
+        for side, sign, half in (
+            ("left", 1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
+            ("right", -1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
+        )
+    },
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is simulated.
+
+    Attributes:
+        problem: The problem.
+        robot: Its robot.
+        plant: What is different from what the controller believes.
+        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        puck: Where the puck lies [m], shape (2,), or None if there is none.
+    """
+
+    problem: Problem
+    robot: Robot
+    plant: Plant
+    tops: Array
+    puck: Array | None = None
+
+    @property
+    def height(self) -> float | None:
+        """Height of the tip over the table [m]; None without a table."""
+        return next((each.z for each in self.problem.constraint if isinstance(each, Table)), None)
+
+
+def scene_xml(scene: Scene) -> str:
+    """Write the scene as MJCF."""
+    gravity = _numbers(scene.robot.chain.gravity)
+    return f"""<mujoco model="{scene.problem.name}">
+<compiler angle="radian" autolimits="true"/>
+<option timestep="{STEP}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
+<visual><global offwidth="1280" offheight="960"/><headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
+<default><geom contype="0" conaffinity="0" mass="0"/></default>
+<worldbody>
+<light pos="0 0 4" dir="0 0 -1" diffuse="0.4 0.4 0.4"/>
+<geom type="plane" pos="0 0 -0.5" size="4 4 0.1" rgba="0.9 0.9 0.92 1"/>
+<geom type="cylinder" fromto="0 0 -0.5 0 0 0.1" size="0.1" rgba="0.4 0.4 0.4 1"/>
+{"".join(_arm(scene))}
+{"".join(_surroundings(scene))}
+</worldbody>
+<contact>
+{"".join(_pairs(scene))}
+</contact>
+</mujoco>"""
+
+
+def _arm(scene: Scene) -> Iterator[str]:
+    """Yield the nested bodies of the arm; the last one holds the tip and what is fixed to it."""
+    chain, names = scene.robot.chain, scene.robot.joint_names
+    ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
+    for index, (joint, name, end, friction) in enumerate(
+        zip(chain.joints, names, ends, joint_friction(scene.robot), strict=True)
+    ):
+        kind = "slide" if joint.prismatic else "hinge"
+        place = f'pos="{_numbers(joint.translation)}" quat="{_quaternion(joint.rotation)}"'
+        yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
+        yield f'<joint name="{name}" type="{kind}" axis="{_numbers(joint.axis)}" damping="{friction.viscous}"'
+        yield f' frictionloss="{friction.dry}"/>'
+        if np.linalg.norm(end) > SHORTEST:
+            rod = index == len(names) - 1
+            radius, colour = (0.012, "0.3 0.3 0.3 1") if rod else (LINK_RADIUS, "1 0.55 0.15 1")
+            yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
+            yield f' rgba="{colour}"/>'
+    yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
+    yield '<site name="tip" size="0.001"/><geom name="mallet" type="sphere" size="0.001"/>'
+    if scene.problem.object_size is not None:
+        size = _numbers(np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem))
+        yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
+    yield "</body>" * (len(names) + 1)
+
+
+def _legal_depth(problem: Problem) -> float:
+    """Return how deep in an obstacle a valid plan may carry the object [m]: so much smaller is what collides."""
+    return max(
+        (each.depth + each.tolerance for each in problem.constraint if isinstance(each, ObjectContact)), default=0.0
+    )
+
+
+def _inertial(joint: Joint, mass: float) -> str:
+    """Write the inertia of a link about its centre of mass, in joint axes."""
+    tensor = mass * joint.inertia
+    rows = [tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2]]
+    numbers = _numbers(np.array(rows))
+    return f'<inertial pos="{_numbers(joint.com)}" mass="{mass * joint.mass!r}" fullinertia="{numbers}"/>'
+
+
+def _surroundings(scene: Scene) -> Iterator[str]:
+    """Yield the obstacles; with a table, the table and its puck."""
+    for box, top in zip(scene.problem.obstacle, scene.tops.tolist(), strict=True):
+        low = top - (DEEP if box.height is None else box.height)
+        centre = np.array([box.x.low + box.x.high, box.y.low + box.y.high, low + top]) / 2
+        half = np.array([box.x.high - box.x.low, box.y.high - box.y.low, top - low]) / 2
+        yield f'<geom name="{box.name}" type="box" pos="{_numbers(centre)}" size="{_numbers(half)}"'
+        yield ' rgba="0.6 0.65 0.7 1"/>'
+    if scene.height is None:
+        return
+    surface = scene.height - hockey.MALLET_HEIGHT
+    middle = hockey.HOME + hockey.LENGTH / 2
+    yield f'<geom type="box" pos="{middle} 0 {surface - 0.02}" size="{hockey.LENGTH / 2} {hockey.WIDTH / 2} 0.02"'
+    yield ' rgba="0.97 0.97 1 1"/>'
+    for name, (x, y, half_x, half_y) in _RIMS.items():
+        yield f'<geom name="{name}" type="box" pos="{x} {y} {surface}" size="{half_x} {half_y} 0.015"'
+        yield ' rgba="0.5 0.5 0.5 1"/>'
+    if scene.puck is not None:
+        yield from _puck(surface, scene.height)
+    yield '<body name="shown mallet" mocap="true">'
+    yield f'<geom type="cylinder" size="{hockey.MALLET_RADIUS} 0.01" pos="0 0 0.01" rgba="0.15 0.15 0.15 1"/>'
+    yield f'<geom type="cylinder" size="0.015 {hockey.MALLET_HEIGHT / 2}" pos="0 0 {hockey.MALLET_HEIGHT / 2}"'
+    yield ' rgba="0.15 0.15 0.15 1"/></body>'
+
+
+def _puck(surface: float, height: float) -> Iterator[str]:
+    """Yield the puck: a disc that meets the bands, and one of both radii that the mallet meets.
+
+    Its coordinates are those of its centre in the world. The larger disc reaches up to where the mallet's lower face
+    passes over the puck, and far enough down.
+    """
+    inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
+    low, high = height - 0.05, height + hockey.PUCK_HEIGHT
+    yield f'<body name="puck" pos="0 0 {surface}">'
+    yield f'<inertial pos="0 0 0" mass="{hockey.PUCK_MASS}" diaginertia="{inertia}"/>'
+    yield f'<joint name="puck x" type="slide" axis="1 0 0" damping="{hockey.PUCK_DRAG}"/>'
+    yield f'<joint name="puck y" type="slide" axis="0 1 0" damping="{hockey.PUCK_DRAG}"/>'
+    yield f'<geom name="puck" type="sphere" size="{hockey.PUCK_RADIUS}" rgba="0 0 0 0"/>'
+    yield f'<geom type="cylinder" size="{hockey.PUCK_RADIUS} {hockey.PUCK_HEIGHT / 2}" rgba="0.85 0.1 0.1 1"'
+    yield f' pos="0 0 {hockey.PUCK_HEIGHT / 2}"/>'
+    radius = hockey.PUCK_RADIUS + hockey.MALLET_RADIUS - 0.001
+    yield f'<geom name="reach" type="cylinder" size="{radius} {(high - low) / 2}" rgba="0 0 0 0"'
+    yield f' pos="0 0 {(low + high) / 2 - surface}"/></body>'
+
+
+def _pairs(scene: Scene) -> Iterator[str]:
+    """Yield what can collide."""
+    if scene.puck is not None:
+        k, b = hockey.bounce()
+        bouncing = f'condim="1" solref="{-k} {-b}" solimp="0.9999 0.9999 0.001"'
+        yield f'<pair geom1="mallet" geom2="reach" {bouncing}/>'
+        for name in _RIMS:
+            yield f'<pair geom1="puck" geom2="{name}" {bouncing}/>'
+    chain = scene.robot.chain
+    lengths = [float(np.linalg.norm(joint.translation)) for joint in chain.joints[1:]]
+    names = [f"link {index}" for index, length in enumerate(lengths, start=1) if index > 1 and length > SHORTEST]
+    names += ["object"] if scene.problem.object_size is not None else []
+    for box in scene.problem.obstacle:
+        for name in names:
+            yield f'<pair geom1="{name}" geom2="{box.name}" {_SOFT}/>'
+
+
+def _quaternion(rotation: Array) -> str:
+    """Write a rotation matrix as MuJoCo's quaternion, scalar first."""
+    from scipy.spatial.transform import Rotation
+
+    return _numbers(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))
+
+
+def _numbers(values: Array) -> str:
+    """Write numbers so that they read back as the same float64."""
+    return " ".join(repr(value) for value in np.asarray(values, float).tolist())

@@ -1,0 +1,156 @@
+"""Whole sets of plans executed, in as many processes as are wanted."""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError, counted
+from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.tips import settle_tips
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.record import open_problem
+from cnpgen.robots.robot import Robot
+from cnpgen.simulator.execute import Execution, execute, load_mujoco
+from cnpgen.simulator.executed import Executed
+from cnpgen.simulator.hockey import puck_of
+from cnpgen.simulator.plant import Plant, as_plant
+from cnpgen.simulator.reference import Reference, reference_of
+from cnpgen.simulator.scene import Scene
+
+Array = NDArray[np.float64]
+
+FORMAT = "cnpgen-simulation"
+FORMAT_VERSION = 1
+FLAGS = ("success", "finished", "hit", "scored", "touched_early", "collided")
+ALONE = 20  # plans up to which a second process is not worth its start
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """What came of executing N plans.
+
+    Attributes:
+        plans: The plans.
+        executed: What came of each, in the same order.
+        plant: The robot that executed them.
+    """
+
+    plans: Plans
+    executed: tuple[Executed, ...]
+    plant: Plant
+
+    def __repr__(self) -> str:
+        succeeded = sum(each.success for each in self.executed)
+        plans = f"{counted(len(self.executed), 'plan')} of {self.plans.problem.name!r}"
+        return f"<{plans} executed by the {self.plant.name} plant, {succeeded:,} with success>"
+
+    def summary(self) -> dict[str, Any]:
+        """Return for JSON what is said of all plans together."""
+        rows = [each.to_dict() for each in self.executed]
+        counts = {name: sum(row[name] for row in rows if name in row) for name in FLAGS if any(name in r for r in rows)}
+        names = {name: None for row in rows for name, value in row.items() if isinstance(value, float)}
+        medians = {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "problem": self.plans.problem.name,
+            "plant": self.plant.name,
+            "plans": len(rows),
+            **counts,
+            "medians": medians,
+        }
+
+
+def simulate_plans(
+    plans: Plans,
+    *,
+    plant: Plant | str = "nominal",
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Simulation:
+    """Execute plans in MuJoCo: computed torque at 1 kHz on a robot with friction that its controller does not know.
+
+    On a table, a plan that ends in motion is a hit: the puck lies 7 cm ahead of where it ends. Every plan is executed
+    for itself: neither the others nor the number of processes change what comes of it.
+
+    Args:
+        plans: The plans.
+        plant: The robot, or its name: "nominal", "heavier" or "delayed".
+        workers: Processes; default one per available core, or one where a second would not pay.
+        progress: Called with the number of plans that were executed since the last call.
+
+    Raises:
+        UsageError: There is no such plant, or there are fewer than one worker.
+        RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
+        MachineError: MuJoCo is missing, or a worker died.
+    """
+    check_plans_type(plans)
+    plant, plans = as_plant(plant), settle_tips(plans)
+    load_mujoco()
+    count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, max(len(plans), 1))
+    executed: list[Executed] = []
+    with closing(share_out(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:
+        for each in results:
+            executed.append(each)
+            if progress is not None:
+                progress(1)
+    return Simulation(plans, tuple(executed), plant)
+
+
+def _simulate(plan: Plans, *, plant: Plant) -> Executed:
+    try:
+        return execute_plan(plan, plant)[2].executed
+    except UsageError as error:
+        return Executed(failure=str(error))
+
+
+def execute_plan(plan: Plans, plant: Plant) -> tuple[Scene, Reference, Execution]:
+    """Execute one plan.
+
+    Args:
+        plan: One plan.
+        plant: The robot.
+
+    Returns:
+        The world, what the controller followed, and what happened.
+
+    Raises:
+        UsageError: It cannot be executed: it is not finite, never arrives, or takes too long.
+        RecipeError: As ``simulate_plans`` does.
+        MachineError: Likewise.
+    """
+    _, robot = open_problem(plan.problem)
+    reference = reference_of(plan.motion, acceleration_limit=robot.acceleration_limit)
+    scene = scene_of(plan, plant)
+    return scene, reference, execute(scene, reference, plan.columns["goal_xyz"][0])
+
+
+def scene_of(problem: Plans, plant: Plant) -> Scene:
+    """Set the scene of one boundary problem: obstacles, and the puck where its goal is a hit.
+
+    Args:
+        problem: One boundary problem, or a plan for it.
+        plant: The robot.
+    """
+    meaning, robot = open_problem(problem.problem)
+    start_xyz, goal_xyz = problem.columns["start_xyz"][0], problem.columns["goal_xyz"][0]
+    scene = Scene(meaning, robot, plant, obstacle_tops(meaning, start_xyz, goal_xyz))
+    if scene.height is None:
+        return scene
+    velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])
+    return replace(scene, puck=puck_of(goal_xyz, velocity))
+
+
+def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:
+    """Velocity of the tip [m/s], shape (3,)."""
+    import pinocchio as pin
+
+    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+    return np.asarray(J[:3] @ dq)

@@ -1,0 +1,179 @@
+"""TrajOpt and AQP, each against something that shares no code with it."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import LinearConstraint, minimize
+
+from cnpgen.benchmark.judging import judge_answer
+from cnpgen.benchmark.planner import Setting
+from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
+from cnpgen.benchmark.planners.knots import knot_constraints
+from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path, striking_path
+from cnpgen.benchmark.planners.sst import Tree
+from cnpgen.benchmark.planners.trajopt import TrajOpt, Transcription
+from cnpgen.benchmark.process import PlannerProcess
+from cnpgen.benchmark.suite import load_suite
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.errors import UsageError
+from cnpgen.plans import Plans, open_problem
+
+
+def one_of(suite: str, index: int = 0) -> Plans:
+    return load_suite(suite).problems(index + 1)[0][index]
+
+
+def transcription(task: Plans) -> Transcription:
+    problem, robot = open_problem(task.problem)
+    at_knots = knot_constraints(problem, robot, task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
+    return Transcription(robot, task.boundary, at_knots)
+
+
+@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+def test_the_derivatives_of_trajopt_are_those_of_its_functions(suite: str) -> None:
+    found = transcription(one_of(suite))
+    x = found.start() + 0.1 * np.random.default_rng(0).normal(size=len(found.start()))
+    x[-1] = 0.7
+    direction = np.random.default_rng(1).normal(size=(4, len(x)))
+    for function, jacobian in ((found.defects, found.defects_jacobian), (found.margins, found.margins_jacobian)):
+        J = jacobian(x)
+        for d in direction:
+            difference = (function(x + 1e-6 * d) - function(x - 1e-6 * d)) / 2e-6
+            np.testing.assert_allclose(J @ d, difference, atol=2e-5)
+
+
+def test_trajopt_meets_its_own_constraints_and_its_boundary_conditions() -> None:
+    task = one_of("hits-81", 40)
+    found = TrajOpt().prepare(Setting(task.problem))(task)
+    assert isinstance(found, Trajectory)
+    own = transcription(task)
+    x = np.concatenate([found.q[1:-1].ravel(), found.dq[1:-1].ravel(), found.ddq.ravel(), [found.duration]])
+    assert np.abs(own.defects(x)).max() < 1e-5
+    assert own.margins(x).min() > -1e-5
+    low, high = own.bounds()
+    assert np.all((x > low - 1e-9) & (x < high + 1e-9))
+    np.testing.assert_allclose(found.q[[0, -1]], [task.boundary.start_q[0], task.boundary.goal_q[0]], atol=1e-12)
+    np.testing.assert_allclose(found.dq[-1], task.boundary.goal_dq[0], atol=1e-12)
+    verdict = judge_answer(task, found)
+    assert verdict.paper.finished
+    assert verdict.metrics.duration < 0.6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_quadratic_programme_of_aqp_has_the_optimum_that_another_solver_finds(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    null = np.linalg.svd(random.normal(size=(3, 6)))[2][3:].T
+    weights, ahead, least = random.uniform(1, 10, 6), random.normal(size=6), 0.3 * random.normal(size=6)
+    low, high = -0.8 - least, 0.8 - least
+    found = nearest_in_null_space(null, weights, ahead, (low, high))
+    H, f = null.T @ (weights[:, None] * null), null.T @ (weights * ahead)
+    other = minimize(
+        lambda a: a @ H @ a / 2 + f @ a,
+        np.zeros(3),
+        jac=lambda a: H @ a + f,
+        method="SLSQP",
+        constraints=[
+            {"type": "ineq", "fun": lambda a: high - null @ a, "jac": lambda _: -null},
+            {"type": "ineq", "fun": lambda a: null @ a - low, "jac": lambda _: null},
+        ],
+        options={"ftol": 1e-14},
+    )
+    assert LinearConstraint(null, low, high).residual(other.x)[0].min() > -1e-9
+    np.testing.assert_allclose(found, other.x, atol=1e-5)
+
+
+def test_a_quadratic_programme_without_solution_is_none() -> None:
+    null = np.linalg.svd(np.random.default_rng(0).normal(size=(3, 6)))[2][3:].T
+    assert nearest_in_null_space(null, np.ones(6), np.zeros(6), (np.full(6, 2.0), np.full(6, 3.0))) is None
+
+
+def length_of(path: PlanePath) -> float:
+    def speed(s: float) -> float:
+        return float(np.linalg.norm(path.at(s + 1e-6) - path.at(s - 1e-6))) / 2e-6
+
+    return float(quad(speed, 1e-6, path.length - 1e-6, limit=200)[0])
+
+
+@pytest.mark.parametrize("hit", [(1.1, 0.3), (0.9, -0.35), (1.0, 0.0)])
+def test_paths_in_the_plane_are_smooth_of_their_length_and_end_where_they_should(hit: tuple[float, float]) -> None:
+    start, end = np.array([0.65, 0.0]), np.array(hit)
+    way = np.array([2.478, 0.0]) - end
+    strike = striking_path(start, end, way, 1.5)
+    np.testing.assert_allclose(strike.at(0.0), start, atol=1e-12)
+    np.testing.assert_allclose(strike.at(strike.length), end, atol=1e-12)
+    assert length_of(strike) == pytest.approx(strike.length, abs=1e-4)
+    last = strike.at(strike.length) - strike.at(strike.length - 1e-5)
+    np.testing.assert_allclose(last / np.linalg.norm(last), way / np.linalg.norm(way), atol=1e-3)
+    steps = np.diff([strike.at(s) for s in np.linspace(0, strike.length, 2000)], axis=0)
+    heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    assert np.abs(np.diff(heading)).max() < 0.1  # no corner
+    points = np.array(list(strike.sampled(0.01)))
+    assert np.all((points > LOW - 1e-9) & (points < HIGH + 1e-9))
+    stop = stopping_path(strike)
+    np.testing.assert_allclose(stop.at(0.0), end, atol=1e-12)
+    first = stop.at(1e-5) - stop.at(0.0)
+    np.testing.assert_allclose(first / np.linalg.norm(first), way / np.linalg.norm(way), atol=1e-3)
+
+
+def test_aqp_hits_where_and_in_the_direction_that_it_should() -> None:
+    task = one_of("hits-81", 40)
+    found = AQP().prepare(Setting(task.problem))(task)
+    assert isinstance(found, Trajectory)
+    tip = task.problem.tip_positions(found.q)
+    assert np.linalg.norm(tip[-1] - task.columns["goal_xyz"][0]) < 1e-3
+    assert np.abs(tip[:, 2] - 0.16).max() < 1e-3
+    way = np.array([2.478, 0.0]) - task.columns["goal_xyz"][0][:2]
+    last = tip[-1, :2] - tip[-2, :2]
+    assert abs(np.arctan2(last[1], last[0]) - np.arctan2(way[1], way[0])) < 0.01
+    robot = open_problem(task.problem)[1]
+    assert np.all(np.abs(np.diff(found.q, axis=0)) <= robot.velocity_limit * found.t[1] * (1 + 1e-6))
+
+
+def test_aqp_plans_hits_only() -> None:
+    with pytest.raises(UsageError, match="plans hits on a table"):
+        AQP().prepare(Setting(one_of("heavy-100").problem))
+
+
+@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+def test_the_paths_of_cbirrt_stay_on_the_manifold_and_are_timed_by_the_velocity_limits(suite: str) -> None:
+    """In a process of its own, as in a benchmark: OMPL tells of leaks when its process ends."""
+    pytest.importorskip("ompl")
+    task = one_of(suite)
+    _, robot = open_problem(task.problem)
+    process = PlannerProcess("cbirrt", Setting(task.problem, time_limit=20))
+    try:
+        found = process.plan(task).answer
+    finally:
+        process.stop()
+    assert isinstance(found, Trajectory)
+    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    for q in found.q:
+        pin.framesForwardKinematics(robot.model, data, q)
+        tip = data.oMf[frame]
+        off = tip.translation[2] - 0.16 if suite == "hits-81" else tip.rotation[2, 2] - 1
+        assert abs(off) < 0.011
+    np.testing.assert_allclose(found.q[[0, -1]], [task.boundary.start_q[0], task.boundary.goal_q[0]], atol=0.01)
+    use = np.abs(np.diff(found.q, axis=0)) / np.diff(found.t)[:, None] / robot.velocity_limit
+    assert use.max() <= 1
+    assert np.median(use.max(axis=1)) > 0.98
+
+
+def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cnpgen.benchmark.planners.sst.ITERATIONS", 3000)
+    task = one_of("hits-81", 40)
+    problem, robot = open_problem(task.problem)
+    tree = Tree(problem, robot, task, np.random.default_rng(0))
+    found = tree.grow(60)
+    assert found is not None
+    assert found.dq is not None
+    tip = task.problem.tip_positions(found.q)
+    goal = task.columns["goal_xyz"][0]
+    assert np.linalg.norm(tip[-1] - goal) < np.linalg.norm(tip[0] - goal) - 0.01
+    assert np.abs(tip[:, 2] - 0.16).max() <= 0.01
+    assert np.all(np.abs(found.dq) <= robot.velocity_limit)
+    ddq = np.diff(found.dq, axis=0) / np.diff(found.t)[:, None]
+    assert np.all(np.abs(ddq) <= robot.acceleration_limit * (1 + 1e-9))
+    step = np.diff(found.q, axis=0) - np.diff(found.t)[:, None] * (found.dq[1:] + found.dq[:-1]) / 2
+    assert np.abs(step).max() < 1e-12  # accelerations are constant over every step
+    np.testing.assert_array_equal(found.q[0], task.boundary.start_q[0])

@@ -1,0 +1,129 @@
+"""Runs that are resumed, and planners that crash, hang or return garbage: each costs its own row."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cnpgen.benchmark.report import save_benchmark_report
+from cnpgen.benchmark.results import answer_from_dict, answer_to_dict, open_results
+from cnpgen.benchmark.run import run_benchmark
+from cnpgen.benchmark.suite import load_suite
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.errors import UsageError
+from cnpgen.schema import registry
+
+BAD = """
+import os, time
+from dataclasses import dataclass
+from cnpgen.benchmark.planner import BenchmarkPlanner
+from cnpgen.benchmark.planners.learned import CNPB
+from cnpgen.plugins import field
+
+@dataclass(frozen=True)
+class Moody(BenchmarkPlanner):
+    "Fails in another way at every problem."
+
+    def prepare(self, setting):
+        good = CNPB().prepare(setting)
+        ways = {
+            0: lambda problem: os._exit(1),
+            1: good,
+            2: lambda problem: "garbage",
+            3: lambda problem: 1 / 0,
+            4: lambda problem: None,
+            5: lambda problem: time.sleep(1000),
+            6: good,
+        }
+        return lambda problem: ways[int(problem.sample_id[0])](problem)
+"""
+
+
+@pytest.fixture
+def moody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A planner of an installed package."""
+    (tmp_path / "moody.py").write_text(BAD, encoding="utf-8")
+    about = tmp_path / "moody-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: moody\nVersion: 1.0\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text("[cnpgen.planners]\nmoody = moody:Moody\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    registry.installed.cache_clear()
+    yield "moody"
+    registry.installed.cache_clear()
+
+
+def test_whatever_a_planner_does_costs_its_own_row_only(
+    moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cnpgen.benchmark.process.SPARE", 0.5)
+    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=7, time_limit=0.2)
+    rows = found.results[moody]
+    endings = [row["ending"] for row in rows]
+    assert endings == ["crashed", "planned", "failed", "failed", "no plan", "out of time", "planned"]
+    assert "garbage" in rows[2]["error"]
+    assert "ZeroDivisionError" in rows[3]["error"]
+    assert [row["answer"] is not None for row in rows] == [False, True, False, False, False, False, True]
+
+
+def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
+    file = tmp_path / "cnp-b.jsonl"
+    text = file.read_text()
+    file.write_text(text + text.splitlines()[-1][:100])  # cut off by an interruption
+    seen: list[str] = []
+    again = run_benchmark(
+        "hits-81",
+        tmp_path,
+        planners=["cnp-b"],
+        n=3,
+        plants=["nominal"],
+        workers=1,
+        progress=lambda *a: seen.append(a[0]),
+    )
+    assert seen == ["cnp-b plans", *["cnp-b, nominal plant"] * 3]
+    assert file.read_text().startswith(text)
+    assert again.results["cnp-b"][0]["planning_s"] == first.results["cnp-b"][0]["planning_s"]
+    assert all(row["executed"]["nominal"]["scored"] for row in again.results["cnp-b"])
+    third = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=3, plants=["nominal"], workers=1)
+    assert third.results == again.results
+    report = save_benchmark_report(third, tmp_path / "report.html").read_text()
+    assert "paper: 100 %" in report
+    assert "<svg" in report
+
+
+def test_results_of_another_run_are_not_mixed_in(tmp_path: Path) -> None:
+    run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)
+    with pytest.raises(UsageError, match="holds results of another run"):
+        run_benchmark("hits-110", tmp_path, planners=["cnp-b"], n=1)
+    run_benchmark("hits-110", tmp_path, planners=["cnp-b"], n=1, force=True)
+    assert json.loads((tmp_path / "cnp-b.jsonl").read_text().splitlines()[0])["suite"] == "hits-110"
+
+
+def test_mistakes_are_found_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"unknown planner 'cnpb'.*did you mean 'cnp-b'"):
+        run_benchmark("hits-81", tmp_path, planners=["cnpb"])
+    with pytest.raises(UsageError, match="unknown plant"):
+        run_benchmark("hits-81", tmp_path, planners=["cnp-b"], plants=["lighter"])
+    with pytest.raises(UsageError, match="time_limit must be above 0"):
+        run_benchmark("hits-81", tmp_path, planners=["cnp-b"], time_limit=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_planner_for_other_problems_is_refused_with_its_reason(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="planner 'aqp' cannot plan here: it plans hits on a table"):
+        run_benchmark("heavy-100", tmp_path, planners=["aqp"], n=1)
+
+
+def test_answers_read_back_as_they_were(tmp_path: Path) -> None:
+    problem = load_suite("hits-81").problems(1)[0]
+    trajectory = Trajectory(problem.boundary.start_q[0, :2] * 0 + [0.0, 1 / 3], problem.boundary.start_q[[0, 0]] / 3)
+    results = open_results(tmp_path / "a.jsonl", {})
+    results.append({"problem": 0, "ending": "planned", "answer": answer_to_dict(trajectory)})
+    again = open_results(tmp_path / "a.jsonl", {})
+    read = answer_from_dict(problem, again.rows[0]["answer"])
+    assert isinstance(read, Trajectory)
+    assert (read.q == trajectory.q).all()
+    assert (read.t == trajectory.t).all()
+    assert read.dq is None

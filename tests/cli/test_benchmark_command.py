@@ -1,0 +1,39 @@
+"""``cnpgen benchmark``: what it lists, prints and writes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cnpgen.cli.main import main
+
+
+def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "--list", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {"hits-81", "hits-110", "heavy-100"} <= found["suites"].keys()
+    assert {"cnp-b", "cnp-b+refine", "solve", "trajopt", "aqp"} <= found["planners"].keys()
+    assert list(found["plants"]) == ["nominal", "heavier", "delayed"]
+
+
+def test_a_short_benchmark_of_all_planners(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mujoco")
+    planners = ["cnp-b", "cnp-b+refine", "solve", "trajopt", "aqp"]
+    options = ["-o", str(tmp_path / "results"), "--n", "1", "--simulate", "--workers", "1"]
+    assert main(["benchmark", "hits-81", "--planners", *planners, *options, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["problems"] == 1
+    for name in planners:
+        assert found["planners"]["nominal"][name]["ratios"]["scored"]["count"] == 1, name
+    assert (tmp_path / "results" / "report.html").is_file()
+    assert main(["benchmark", "hits-81", "--planners", *planners, *options]) == 0  # from what is there
+    out = capsys.readouterr().out
+    assert "nominal plant" in out
+    assert "(paper: 92.59 %)" in out
+
+
+def test_mistakes_are_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark"]) == 2
+    assert "which suite?" in capsys.readouterr().err
+    assert main(["benchmark", "hits-81", "--plant", "heavier", "-o", str(tmp_path)]) == 2
+    assert "goes with --simulate only" in capsys.readouterr().err

@@ -1,0 +1,52 @@
+"""A good file of every kind, from which strangers' files are made."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.planner.model_file import save_model
+from cnpgen.plans.save import save_plans
+from cnpgen.refine.journal import open_journal
+from cnpgen.refine.task import Outcome, Refined
+from cnpgen.schema.catalogue import recipes_root
+from cnpgen.store.shard import read_shard
+from cnpgen.training.checkpoint import Checkpoints
+from cnpgen.training.state import start_state
+from tests.examples.models import boundary_of_columns, untrained_model
+from tests.examples.plan_files import plans_of, unsealed
+from tests.examples.plans import load as stored_plan
+
+IDENTITY = {"steps": 10}  # of the run that the checkpoint and the journal are of
+
+
+def make_good_files(folder: Path) -> None:
+    """Make a good file of every kind, once."""
+    tiny = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24, "validation": 8})
+    make_dataset(tiny, folder / "set", workers=1, shard_size=24)
+    shutil.copytree(recipes_root() / "problems" / "airhockey", folder / "recipes")
+    for kind in ("pipelines", "datasets"):
+        shutil.copy(recipes_root() / kind / "airhockey-hit.toml", folder / "recipes" / f"{kind}.toml")
+    for name, old, new in (
+        ("datasets.toml", 'pipeline = "airhockey-hit"', 'pipeline = "./pipelines.toml"'),
+        ("pipelines.toml", 'problem = "airhockey"', 'problem = "./problem.toml"'),
+    ):
+        path = folder / "recipes" / name
+        path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    plan = stored_plan("hit")
+    save_plans(folder / "plans.h5", plans_of(plan, plan))
+    shutil.copy(folder / "plans.h5", folder / "unsealed.h5")
+    unsealed(folder / "unsealed.h5")
+    columns = read_shard(folder / "set" / "train" / "shard-00000.h5")
+    model = untrained_model("airhockey", boundary_of_columns(columns, 20))
+    save_model(folder / "model.h5", replace(model, training={"dataset": {"name": "x"}, "stages": [{"use": "y"}]}))
+    state = start_state(np.zeros(10, np.float32), terms=3, steps=10)
+    Checkpoints(folder / "checkpoint", IDENTITY).save(state)
+    journal = open_journal(folder / "journal", json.dumps(IDENTITY))
+    done = Refined(np.zeros((15, 6)), np.ones(20), Outcome.SOLVED, "ok", 3, 1.0)
+    journal.append([0], [done])
+    journal.close()

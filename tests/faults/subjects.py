@@ -1,0 +1,327 @@
+"""The kinds of files that strangers send: how a good one is changed, mostly under a right seal, and how it is read."""
+
+import hashlib
+import json
+import shutil
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import h5py
+import numpy as np
+
+from cnpgen.cli.inspect_command import inspection_text
+from cnpgen.errors import CnpgenError
+from cnpgen.loader.load import load_dataset
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.planner.model_file import load_model
+from cnpgen.plans.boundary_file import read_boundary_file
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.load import load_plans
+from cnpgen.plans.plans import screen
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.record import open_problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.refine.journal import open_journal
+from cnpgen.store.blueprint import from_json
+from cnpgen.store.files.documents import canonical_sha256, save_document
+from cnpgen.store.files.sealed import BLOCK, Content, read_sealed, seal, under_seal
+from cnpgen.store.inspection import inspect_dataset
+from cnpgen.store.shard import read_schema, read_shard
+from cnpgen.training.checkpoint import Checkpoints
+from cnpgen.validate.dataset import validate_dataset
+from tests.faults.good_files import IDENTITY
+from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf
+
+DOCUMENTS = ("plan.json", "manifest.json", "stats.json", "train/shard-00000.json", "validation/shard-00000.json")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A kind of file.
+
+    Attributes:
+        change: Puts a changed file into a folder, of good ones in another folder.
+        read: Reads it in every way that cnpgen has.
+    """
+
+    change: Callable[[Path, Path, Random], None]
+    read: Callable[[Path, Random], None]
+
+
+def _change_recipe(good: Path, folder: Path, draw: Random) -> None:
+    shutil.copytree(good / "recipes", folder / "recipes")
+    path = folder / "recipes" / draw.choice(("datasets.toml", "pipelines.toml", "problem.toml"))
+    content = path.read_bytes()
+    if draw.random() < 0.2:
+        path.write_bytes(change_bytes(content, draw))
+    else:
+        path.write_text(change_text(content.decode(), draw), encoding="utf-8", errors="replace")
+
+
+def _read_recipe(folder: Path, draw: Random) -> None:
+    recipe = load_dataset_recipe(folder / "recipes" / "datasets.toml")
+    load_robot(recipe.pipeline.problem)
+
+
+def _change_urdf(good: Path, folder: Path, draw: Random) -> None:
+    shutil.copytree(good / "recipes", folder / "recipes")
+    path = next((folder / "recipes").glob("*.urdf"))
+    content = path.read_bytes()
+    if draw.random() < 0.2:
+        path.write_bytes(change_bytes(content, draw))
+    else:
+        path.write_text(change_urdf(content.decode(), draw), encoding="utf-8", errors="replace")
+
+
+def _read_urdf(folder: Path, draw: Random) -> None:
+    robot = load_robot(load_problem(folder / "recipes" / "problem.toml"))
+    assert robot.skeleton is not None
+
+
+def _change_document(good: Path, folder: Path, draw: Random) -> None:
+    shutil.copytree(good / "set", folder / "set")
+    name = draw.choice(DOCUMENTS)
+    path = folder / "set" / name
+    if draw.random() < 0.1:
+        path.write_bytes(change_bytes(path.read_bytes(), draw))
+        return
+    document = json.loads(path.read_text(encoding="utf-8"))
+    del document["self_sha256"]
+    changed = change_json(document, draw)
+    if name == "plan.json" and draw.random() < 0.7:
+        _follow(folder / "set", changed)
+    _save(path, changed)
+    if name != "manifest.json":
+        _list_again(folder / "set")
+
+
+def _follow(folder: Path, plan: dict[str, Any]) -> None:
+    """Give all documents the fingerprint of a changed plan.json, as a forger would."""
+    with suppress(CnpgenError, ValueError, KeyError, TypeError):
+        plan["fingerprint"] = from_json(plan).fingerprint
+    for name in DOCUMENTS[1:]:
+        document = json.loads((folder / name).read_text(encoding="utf-8"))
+        del document["self_sha256"]
+        _save(folder / name, {**document, "plan_fingerprint": plan.get("fingerprint")})
+
+
+def _list_again(folder: Path) -> None:
+    """Bring the digests in the manifest up to date."""
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    del manifest["self_sha256"]
+    for name, entry in manifest["files"].items():
+        entry |= {"sha256": _sha256(folder / name), "bytes": (folder / name).stat().st_size}
+    for split in manifest["splits"].values():
+        for entry in split["shards"]:
+            entry["sidecar"]["sha256"] = _sha256(folder / entry["sidecar"]["file"])
+            entry |= {"sha256": _sha256(folder / entry["file"]), "bytes": (folder / entry["file"]).stat().st_size}
+    files = sorted(
+        (entry["file"], entry["sha256"]) for split in manifest["splits"].values() for entry in split["shards"]
+    )
+    lines = "".join(f"{sha256}  {file}\n" for file, sha256 in files)
+    _save(folder / "manifest.json", {**manifest, "fingerprint": hashlib.sha256(lines.encode()).hexdigest()})
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _save(path: Path, document: Mapping[str, Any]) -> None:
+    """Seal a document, whatever is in it."""
+    with suppress(TypeError, ValueError, AttributeError, RecursionError):
+        save_document(path, document)
+
+
+def _read_set(folder: Path, draw: Random) -> None:
+    """Read a dataset in every way; each way may say no."""
+    path = folder / "set"
+    ways: list[Callable[[], Any]] = [
+        lambda: load_dataset(path, verify=draw.random() < 0.5).arrays("train"),
+        lambda: next(iter(load_dataset(path, allow_incomplete=True).batches(4))),
+        lambda: inspection_text(inspect_dataset(path)),
+        lambda: validate_dataset(path, deep=draw.random() < 0.1, workers=1).summary(),
+    ]
+    failures = []
+    for way in ways:
+        try:
+            way()
+        except CnpgenError as error:
+            failures.append(error)
+    if failures:
+        raise failures[0]
+
+
+def _change_shard(good: Path, folder: Path, draw: Random) -> None:
+    shutil.copytree(good / "set", folder / "set")
+    path = folder / "set" / "train" / "shard-00000.h5"
+    path.write_bytes(_changed_hdf5(path.read_bytes(), draw))
+    sidecar = path.with_suffix(".json")
+    record = json.loads(sidecar.read_text(encoding="utf-8"))
+    del record["self_sha256"]
+    _save(sidecar, {**record, "sha256": _sha256(path), "bytes": path.stat().st_size})
+    _list_again(folder / "set")
+
+
+def _changed_hdf5(content: bytes, draw: Random, *, first: int = 0) -> bytes:
+    """Change the bytes of an HDF5 file, most of them in its headers and not among its numbers."""
+    return content[:first] + change_bytes(content[first:], draw, among=_headers(content, first))
+
+
+@cache
+def _headers(content: bytes, first: int) -> list[int]:
+    """List the places of a file that are among many zeros, as headers are, counted from the first."""
+    parts = range(first, len(content), 256)
+    among = [part for part in parts if part < first + 2048 or content[part : part + 256].count(0) > 100]
+    return [place - first for part in among for place in range(part, min(part + 256, len(content)))]
+
+
+def _read_shard(folder: Path, draw: Random) -> None:
+    path = folder / "set" / "train" / "shard-00000.h5"
+    if draw.random() < 0.5:
+        read_schema(path)
+        read_shard(path)
+    _read_set(folder, draw)
+
+
+def _change_plans(good: Path, folder: Path, draw: Random) -> None:
+    content = (good / "unsealed.h5").read_bytes()
+    path = folder / "plans.h5"
+    if draw.random() < 0.3:
+        path.write_bytes(content)
+        _change_values(path, draw)
+    else:
+        path.write_bytes(_changed_hdf5(content, draw))
+    if draw.random() < 0.3 and path.stat().st_size > BLOCK:
+        path.write_bytes(under_seal(path.read_bytes(), kind="cnpgen-plans", version=1))
+
+
+def _change_values(path: Path, draw: Random) -> None:
+    """Change a dataset or an attribute of a file of plans as h5py does."""
+    with h5py.File(path, "a") as file:
+        name = draw.choice([*file])
+        if draw.random() < 0.5:
+            values = file[name][()]
+            flat = values.reshape(-1)
+            flat[draw.randrange(len(flat))] = draw.choice((0, 1, 100)) if values.dtype.kind in "iu" else draw.choice(
+                (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, -1e200, 0.0)
+            )  # fmt: skip
+            del file[name]
+            shapes = (values.shape, values.shape, (*values.shape, 1), values.shape[1:], (0, *values.shape[1:]), (1,))
+            stored = draw.choice(("f8", "f4", "i8", "u1", values.dtype))
+            with np.errstate(all="ignore"):
+                file[name] = np.resize(values, draw.choice(shapes)).astype(stored)
+        else:
+            key = draw.choice([*file.attrs])
+            value = file.attrs[key]
+            text = value.decode() if isinstance(value, bytes) else str(value)
+            with suppress(ValueError):
+                text = json.dumps(change_json(json.loads(text), draw))
+            odd = (text, text[:-1], np.int64(draw.choice((-1, 0, 3, 10**9))), 1.5, [1, 2], "", "airhockey", "/dev/zero")
+            file.attrs[key] = draw.choice(odd)
+            if key == "problem_recipe" and draw.random() < 0.7:
+                file.attrs[key] = text
+                with suppress(CnpgenError, ValueError):
+                    file.attrs["problem_sha256"] = _comparable(text, file.attrs["problem_urdf"])
+
+
+def _comparable(recipe: str, urdf: Any) -> str:
+    from cnpgen.problems.record import ProblemRecord
+
+    with suppress(KeyError, TypeError, AttributeError):
+        return ProblemRecord(recipe, urdf.decode() if isinstance(urdf, bytes) else urdf).comparable_sha256
+    return canonical_sha256({})
+
+
+def _read_plans(folder: Path, draw: Random) -> None:
+    path = folder / "plans.h5"
+    with suppress(CnpgenError):
+        read_boundary_file(path).problem()
+    plans = load_plans(path)
+    screen(plans)
+    if draw.random() < 0.2 and len(plans):
+        evaluate_plans(plans[:2], workers=1).summary()
+
+
+def _change_sealed(name: str, kind: str) -> Callable[[Path, Path, Random], None]:
+    def change(good: Path, folder: Path, draw: Random) -> None:
+        content = (good / name).read_bytes()
+        path = folder / name
+        how = draw.random()
+        if how < 0.1:
+            path.write_bytes(change_bytes(content, draw))
+        elif how < 0.6:
+            path.write_bytes(under_seal(_changed_hdf5(content, draw, first=BLOCK), kind=kind, version=1))
+        else:
+            found = read_sealed(good / name, kind=kind, version=1)
+            path.write_bytes(seal(_changed_content(found, draw), kind=kind, version=1))
+
+    return change
+
+
+def _changed_content(content: Content, draw: Random) -> Content:
+    """Change a text or an array of a sealed file."""
+    arrays, texts = dict(content.arrays), dict(content.texts)
+    if draw.random() < 0.7:
+        name = draw.choice([*texts])
+        try:
+            texts[name] = json.dumps(change_json(json.loads(texts[name]), draw))
+        except ValueError:
+            texts[name] = change_text(texts[name], draw).encode(errors="replace").decode()
+    else:
+        name = draw.choice([*arrays])
+        odd = (arrays[name][..., :-1], arrays[name][None], np.zeros(0), np.zeros((2, 2, 2)), arrays[name].astype("i8"))
+        arrays[name] = draw.choice(odd)
+        if draw.random() < 0.2:
+            del arrays[name]
+    return Content(arrays, texts)
+
+
+def _read_model(folder: Path, draw: Random) -> None:
+    model = load_model(folder / "model.h5")
+    str(model)
+    if draw.random() < 0.3:
+        open_problem(model.problem)
+
+
+def _read_checkpoint(folder: Path, draw: Random) -> None:
+    Checkpoints(folder / "checkpoint", IDENTITY).load()
+
+
+def _change_journal(good: Path, folder: Path, draw: Random) -> None:
+    content = (good / "journal").read_bytes()
+    if draw.random() < 0.3:
+        (folder / "journal").write_bytes(change_bytes(content, draw))
+        return
+    begin = content.index(json.dumps(IDENTITY).encode()) + len(json.dumps(IDENTITY))  # of the frame of a plan
+    payload = change_bytes(content[begin + 40 :], draw)
+    head = len(payload).to_bytes(8, "little") + hashlib.sha256(payload).digest()
+    (folder / "journal").write_bytes(content[:begin] + head + payload)
+
+
+def _read_journal(folder: Path, draw: Random) -> None:
+    open_journal(folder / "journal", json.dumps(IDENTITY)).close()
+
+
+SUBJECTS: dict[str, Subject] = {
+    "recipe": Subject(_change_recipe, _read_recipe),
+    "urdf": Subject(_change_urdf, _read_urdf),
+    "document": Subject(_change_document, _read_set),
+    "shard": Subject(_change_shard, _read_shard),
+    "plans": Subject(_change_plans, _read_plans),
+    "model": Subject(_change_sealed("model.h5", "cnpgen-model"), _read_model),
+    "checkpoint": Subject(_change_sealed("checkpoint", "cnpgen-checkpoint"), _read_checkpoint),
+    "journal": Subject(_change_journal, _read_journal),
+}
+
+
+def read_quietly(subject: Subject, folder: Path, draw: Random) -> None:
+    """Read a changed file; warnings are no failures."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        subject.read(folder, draw)

@@ -1,0 +1,39 @@
+"""Whether a plan is valid does not depend on how finely it is looked at, even where it lies at a tolerance."""
+
+from dataclasses import replace
+
+import pytest
+
+from cnpgen.judges.plans import Margin
+from tests.examples.plans import Plan, bent, load
+
+more = pytest.mark.extended  # the same claim of other plans
+NEAR = 1e-5  # of what is allowed: so near to the tolerance do these plans lie
+
+
+def at_the_tolerance(plan: Plan, margin: Margin, by: float) -> Plan:
+    """The plan in a problem in which one condition allows what it exceeds and a little more, all others anything."""
+    share = margin.excess / margin.allowed * (1 + by)
+    now = plan.problem.constraint
+    constraints = tuple(
+        replace(each, tolerance=each.tolerance * (share if each.reason == margin.reason else 1e3)) for each in now
+    )
+    return replace(plan, problem=replace(plan.problem, constraint=constraints))
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=more), pytest.param(2, marks=more)])
+@pytest.mark.parametrize("label", ["hit", "replan", "transport", "dragging"])
+def test_a_plan_at_a_tolerance_is_valid_at_every_step_or_at_none(label: str, seed: int) -> None:
+    plan = bent(load(label), 0.03, seed=seed)
+    tried = 0
+    for name, margin in plan.judged().margins.items():
+        if margin.reason != "boundary conditions" and margin.excess > 1e-6:
+            near = plan
+            for _ in range(4):  # each time more exactly, since it decides
+                near = at_the_tolerance(near, near.judged().margins[name], 0.0)
+            exact = near.judged().margins[name]
+            for by in (NEAR, -NEAR):
+                judged = [at_the_tolerance(near, exact, by).judged(step=step) for step in (5e-3, 1e-3, 2e-4)]
+                assert [verdict.valid for verdict in judged] == [by > 0] * 3, name
+                tried += 1
+    assert tried >= 2

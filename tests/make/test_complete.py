@@ -1,0 +1,113 @@
+"""Completing tasks from Python and from tables: problems to solve, which task each is, what is wrong with a table."""
+
+import h5py
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.make.complete import complete, complete_table
+
+GOALS = [[1.0, 0.1], [3.0, 0.0], [1.1, -0.2]]  # m; the second is out of reach
+ANGLES = [0.0, 0.1, 0.2]  # rad
+
+
+@pytest.fixture(scope="module")
+def found():
+    return complete("airhockey-replan", goal_xyz=GOALS, hit_angle=ANGLES)
+
+
+def test_problems_say_which_tasks_they_are_and_the_others_why_they_have_no_answer(found):
+    assert found.reasons == ("", "no hitting configuration", "")
+    assert found.rejections == {"no hitting configuration": 1}
+    np.testing.assert_array_equal(found.plans.sample_id, [0, 2])
+    np.testing.assert_allclose(found.plans.columns["goal_xyz"][:, :2], [GOALS[0], GOALS[2]])
+    np.testing.assert_array_equal(found.plans.columns["hit_angle"], [0.0, 0.2])
+    assert "2 of 3 tasks" in repr(found)
+
+
+def test_what_is_completed_can_be_solved(found):
+    assert cnpgen.solve_plans(found.plans[0], workers=1).valid.all()
+
+
+def test_one_task_is_written_without_a_list_and_one_value_holds_for_all():
+    (alone,) = complete("airhockey-hit", goal_xyz=[1.0, 0.1], hit_angle=0.3).plans
+    both = complete("airhockey-hit", goal_xyz=[[1.0, 0.1], [1.0, 0.2]], hit_angle=0.3).plans
+    np.testing.assert_array_equal(alone.boundary.goal_q[0], both.boundary.goal_q[0])
+    np.testing.assert_array_equal(both.columns["hit_angle"], [0.3, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"goal_xyz": [1.0]}, r"goal_xyz must have shape \(3,\) or \(N, 3\), got \(1,\)"),
+        ({"goal_xyz": [np.nan, 0.0]}, r"goal_xyz must be finite, got \[nan +0.\] in task 0"),
+        (
+            {"goal_xyz": np.zeros((3, 2)), "hit_angle": [0.0, 1.0]},
+            "hit_angle is given for 2 tasks, another",
+        ),
+        ({"goal_xyz": np.zeros((0, 2))}, "goal_xyz is of no task"),
+        ({"goal_xyz": "here"}, "goal_xyz must be an array of numbers"),
+    ],
+)
+def test_columns_of_a_wrong_shape_are_refused(columns, message):
+    with pytest.raises(UsageError, match=message):
+        complete("airhockey-hit", **columns)
+
+
+def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
+    lines = [
+        "goal_xyz.x, goal_xyz.y ,hit_angle",
+        *(f"{x},{y},{a}" for (x, y), a in zip(GOALS, ANGLES, strict=True)),
+        "",
+    ]
+    (tmp_path / "tasks.csv").write_text("\n".join(lines), encoding="utf-8-sig")
+    with h5py.File(tmp_path / "tasks.h5", "w") as file:
+        file["goal_xyz"], file["hit_angle"] = np.array([[*goal, 0.16] for goal in GOALS]), ANGLES
+    with h5py.File(tmp_path / "parts.h5", "w") as file:
+        (file["goal_xyz.x"], file["goal_xyz.y"]), file["hit_angle"] = np.array(GOALS).T, ANGLES
+    for name in ("tasks.csv", "tasks.h5", "parts.h5"):
+        again = complete_table("airhockey-replan", tmp_path / name)
+        assert again.reasons == found.reasons
+        np.testing.assert_array_equal(again.plans.boundary.goal_dq, found.plans.boundary.goal_dq)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty: its first line must name columns"),
+        ("goal_xyz.x,goal_xyz.w\n1,2\n", "cannot give 'goal_xyz.w' (did you mean 'goal_xyz."),
+        ("colour,goal_xyz.y\n1,2\n", "cannot give 'colour', only start_xyz, goal_xyz, start_q"),
+        ("goal_xyz.y,hit_angle\n1,2\n", "lacks goal_xyz.x, goal_xyz.z beside goal_xyz.y"),
+        ("start_q.joint_1,goal_xyz.x,goal_xyz.y\n1,2,3\n", "lacks start_q.joint_2"),
+        ("goal_xyz.x,goal_xyz.y\n1,2,3\n", "line 2 has 3 values, the first line names 2 columns"),
+        ("goal_xyz.x,goal_xyz.y\n1,2\n\n1,left\n", "line 4: goal_xyz.y must be a number, got 'left'"),
+        ("goal_xyz.x,goal_xyz.y\n1,nan\n", "goal_xyz.y must be a finite number in every task, got nan in task 0"),
+        ("goal_xyz.x,goal_xyz.x\n1,2\n", "the column 'goal_xyz.x' is there more than once"),
+    ],
+)
+def test_a_table_with_a_mistake_is_refused_with_the_place(tmp_path, text, message):
+    path = tmp_path / "tasks.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DatasetError) as error:
+        complete_table("airhockey-replan", path)
+    assert message in str(error.value)
+
+
+def test_a_table_without_tasks_is_refused(tmp_path):
+    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n", encoding="utf-8")
+    with pytest.raises(UsageError, match="goal_xyz is of no task"):
+        complete_table("airhockey-replan", tmp_path / "tasks.csv")
+
+
+def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_path):
+    with h5py.File(tmp_path / "long.h5", "w") as file:
+        file["goal_xyz"], file["hit_angle"] = np.zeros((2, 3)), [0.0]
+    with h5py.File(tmp_path / "text.h5", "w") as file:
+        file["goal_xyz"] = "here"
+    for name, message in (
+        ("long", "one value per task each, got goal_xyz"),
+        ("text", "goal_xyz must hold numbers, got object"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            complete_table("airhockey-replan", tmp_path / f"{name}.h5")

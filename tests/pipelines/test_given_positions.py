@@ -1,0 +1,146 @@
+"""Given positions: grids and lists instead of draws, each task once, those without an answer counted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.dataset import make_dataset
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.stages.behind_puck import BehindPuck
+from cnpgen.pipelines.stages.stage import Round
+from cnpgen.store.blueprint import shards
+from cnpgen.store.reader import open_dataset
+from cnpgen.store.record import load_record
+from cnpgen.validate.dataset import validate_dataset
+from tests.conftest import Arm, Prepare
+
+LIST = """\
+name = "listed"
+problem = "airhockey"
+
+[[stage]]
+use = "given-positions"
+{positions}
+
+[[stage]]
+use = "at-rest"
+end = "start"
+
+[[stage]]
+use = "hit-angle-to-goal"
+target = "[2.49, 0] m"
+
+[[stage]]
+use = "hitting-configuration"
+near = "base"
+
+[[stage]]
+use = "hitting-velocity"
+full_speed = 1.0
+"""
+THREE = 'goal = ["[1.0, 0.1, 0.16] m", "[3.0, 0, 0.16] m", [0.9, -0.2, 0.16], "[4.0, 0, 0.16] m"]'
+
+
+@pytest.fixture
+def recipe(tmp_path: Path):
+    def written(positions: str) -> Path:
+        path = tmp_path / "listed.toml"
+        path.write_text(LIST.format(positions=positions), encoding="utf-8")
+        return path
+
+    return written
+
+
+def test_the_81_pucks_are_met_behind_their_centres_as_fast_as_possible(prepare: Prepare):
+    prepared = prepare("airhockey-pucks")
+    rows = prepared.block(0, "test", 0).columns
+    puck = np.stack(np.meshgrid(np.linspace(0.8, 1.2, 9), np.linspace(-0.4, 0.4, 9), indexing="ij")).reshape(2, -1)
+    along = np.array([[2.478], [0.0]]) - puck
+    along /= np.linalg.norm(along, axis=0)
+    np.testing.assert_allclose(rows["goal_xyz"][:2], puck - 0.07 * along, atol=1e-12)
+    np.testing.assert_array_equal(rows["hit_speed"], rows["hit_speed_max"])
+    np.testing.assert_array_equal(rows["start_q"].T, [prepared.context.robot.base] * 81)
+    arm = Arm(prepared.context.robot)
+    for i in range(0, 81, 9):
+        q, dq = rows["goal_q"][:, i].copy(), rows["goal_dq"][:, i].copy()
+        np.testing.assert_allclose(arm.pose(q).translation[:2], rows["goal_xyz"][:2, i], atol=1e-8)
+        np.testing.assert_allclose(arm.velocity(q, dq)[:2], rows["hit_speed"][0, i] * along[:, i], atol=1e-9)
+
+
+def test_a_dataset_has_one_row_for_each_answer_and_counts_the_other_tasks(recipe, tmp_path):
+    made = make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", workers=1)
+    assert made.rows == {"train": 2}
+    dataset = open_dataset(made.folder)
+    np.testing.assert_allclose(dataset.read("train")["goal_xyz"], [[1.0, 0.1, 0.16], [0.9, -0.2, 0.16]])
+    np.testing.assert_array_equal(dataset.read("train")["attempts"], [1, 3])  # a list ends with its last row
+    (task,) = shards(made.blueprint)
+    fates = load_record(made.folder, task).fates
+    assert (fates.tried, fates.accepted, fates.rejections["no hitting configuration"]) == (4, 2, 2)  # the last one, too
+    assert validate_dataset(made.folder, deep=True, regenerate=1, workers=1).ok
+
+
+def test_shards_of_one_row_hold_the_same_rows_and_the_same_counts(recipe, tmp_path):
+    made = make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", workers=1, shard_size=1)
+    tried = [load_record(made.folder, task).fates.tried for task in shards(made.blueprint)]
+    assert tried == [1, 3]
+
+
+def test_more_rows_than_answers_are_refused_with_the_reasons(recipe, tmp_path):
+    with pytest.raises(UsageError, match=r"2 rows, of 4 tasks \(2 no hitting configuration\): got n = 3"):
+        make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", n=3)
+    assert not (tmp_path / "rows").exists()
+    for n in (3, 5):
+        with pytest.raises(UsageError, match=r"listed: .* rows are asked for"):
+            draw_boundary_problems(recipe(THREE), n)
+    assert len(draw_boundary_problems(recipe(THREE), 2)) == 2
+
+
+def test_no_answer_at_all_is_refused(recipe, tmp_path):
+    with pytest.raises(UsageError, match=r"0 rows, of 1 tasks \(1 no hitting configuration\)"):
+        make_dataset(load_dataset_recipe(recipe('goal = ["[3.0, 0, 0.16] m"]')), tmp_path / "rows")
+
+
+def test_two_splits_of_the_same_tasks_are_refused(recipe, tmp_path):
+    recipe(THREE)
+    dataset = tmp_path / "dataset.toml"
+    dataset.write_text('name = "d"\npipeline = "listed.toml"\n[splits]\ntrain = 1\ntest = 1\n', encoding="utf-8")
+    with pytest.raises(UsageError, match="the same in its splits train, test"):
+        make_dataset(load_dataset_recipe(dataset), tmp_path / "rows")
+
+
+@pytest.mark.parametrize(
+    ("positions", "mistake"),
+    [
+        ("", "stage 1.goal: either a list of goals or a grid"),
+        (THREE + '\ngrid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [1, 1, 1]', "either a list of goals or a grid"),
+        ('grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [2, 2]', "stage 1.counts: expected 3 entries"),
+        (THREE + '\nstart = ["[0.6, 0, 0.16] m", "[0.7, 0, 0.16] m"]', "one for each of 4, got 2"),
+        ('grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [2, 0, 1]', "0 is too small, expected at least 1"),
+    ],
+)
+def test_mistakes_in_the_recipe_are_said_with_their_keys(recipe, positions, mistake):
+    with pytest.raises(RecipeError) as error:
+        load_pipeline(recipe(positions))
+    assert mistake in str(error.value)
+
+
+def test_starts_can_be_listed_for_a_stage_that_finds_their_joints(tmp_path, prepare):
+    text = LIST.format(positions=THREE + '\nstart = ["[0.65, 0.02, 0.16] m"]')
+    text = text.replace('[[stage]]\nuse = "at-rest"', '[[stage]]\nuse = "start-ik"\n\n[[stage]]\nuse = "at-rest"')
+    (tmp_path / "from.toml").write_text(text, encoding="utf-8")
+    rows = prepare(load_pipeline(tmp_path / "from.toml")).block(0, "train", 0, stop=2).columns
+    np.testing.assert_array_equal(rows["start_xyz"].T, [[0.65, 0.02, 0.16]] * 2)
+
+
+def test_the_mallet_is_behind_the_puck_on_the_line_of_the_hit():
+    draws = Round(2)
+    draws["goal_xyz"], draws["hit_angle"] = (
+        np.array([[1.0, 1.0], [0.0, 0.1], [0.16, 0.16]]),
+        np.array([[0.0, np.pi / 2]]),
+    )
+    BehindPuck(distance=0.07).prepare(None)(draws, np.random.default_rng(0))
+    np.testing.assert_allclose(draws["goal_xyz"].T, [[0.93, 0, 0.16], [1.0, 0.03, 0.16]], atol=1e-15)

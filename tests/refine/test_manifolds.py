@@ -1,0 +1,34 @@
+"""Every manifold of the tip in the refiner: motions from rest to rest that keep it, found from nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.kernels.library import problem_kernels
+from cnpgen.refine.jury import Jury
+from cnpgen.refine.polish import refine_task
+from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.task import Task
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.world.state import World
+from tests.examples.manifolds import MANIFOLDS, ROBOT, ends_on, problem_on
+
+TWICE = {"rectangle", "line"}  # beside a plane and a pose they only repeat the claim
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.extended) if name in TWICE else name for name in MANIFOLDS]
+)
+def test_a_motion_on_a_manifold_is_found_from_nothing(name: str, tmp_path: Path) -> None:
+    problem, q, world = problem_on(name), ends_on(name), World(ROBOT, (), None)
+    rest, tips = np.zeros((1, ROBOT.n)), []
+    for each in q:
+        world.set_state(each, 0 * each, 0 * each, np.zeros(0))
+        tips.append(world.tip_position)
+    kernels = problem_kernels(problem, ROBOT, "numpy", tmp_path)
+    tool = Refiner(problem, ROBOT, kernels=kernels, world=world)
+    boundary = Boundary(q[0][None], rest, rest, q[1][None], rest)
+    found = refine_task(tool, Jury(problem, ROBOT, degree=7), Task(boundary, np.zeros(0), *tips))
+    assert found.valid, found
+    assert np.linalg.norm(tips[1] - tips[0]) > 0.2

@@ -1,0 +1,154 @@
+"""URDFs of strangers: what would end the process, or is no URDF, is a mistake in the recipe."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.errors import RecipeError
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import open_problem, record_problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.urdf import MOST_BYTES, MOST_DEPTH, read_urdf, urdf_tree
+from cnpgen.world.state import World
+
+SHIPPED = load_problem("heavy-object")
+LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
+
+
+def problem_with(folder: Path, urdf: str | bytes) -> Path:
+    """A problem file beside a URDF."""
+    text = SHIPPED.path.read_text(encoding="utf-8").replace(f'"{SHIPPED.robot.urdf}"', '"robot.urdf"')
+    (folder / "problem.toml").write_text(text, encoding="utf-8")
+    (folder / "robot.urdf").write_bytes(urdf.encode() if isinstance(urdf, str) else urdf)
+    return folder / "problem.toml"
+
+
+def shipped_with(*changes: tuple[str, str]) -> str:
+    text = SHIPPED.urdf_text
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def load(path: Path) -> Problem:
+    problem = load_problem(path)
+    load_robot(problem)
+    return problem
+
+
+def chain(count: int, kind: str = "fixed") -> str:
+    links = "".join(f'<link name="l{i}"/>' for i in range(count + 1))
+    joints = "".join(
+        f'<joint name="j{i}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>{LIMIT}</joint>'
+        for i in range(count)
+    )
+    return f'<robot name="r">{links}{joints}</robot>'
+
+
+@pytest.mark.parametrize(
+    ("urdf", "message"),
+    [
+        (chain(5000), "it has 5,001 links, expected at most 1,000"),
+        ("<robot>" + "<x>" * 10_000 + "</x>" * 10_000 + "</robot>", f"more than {MOST_DEPTH} elements in one another"),
+        ('<!DOCTYPE robot [<!ENTITY a "aaaa">]><robot name="&a;"/>', "it has a document type"),
+        (shipped_with(("robot name=", "robot name=")).replace("<robot ", "<robot title='Grün' ", 1).encode("latin-1"),
+         r"line \d+: not UTF-8: byte 0xfc; save the URDF as UTF-8"),
+        ("<robot", "it is not XML"),
+        (b"", "it is not XML"),
+        (b"<robot>" + bytes(8) + b"</robot>", "it is not XML"),
+    ],
+    ids=["chain", "depth", "entities", "latin-1", "cut off", "empty", "zeros"],
+)  # fmt: skip
+def test_what_no_robot_needs_is_a_mistake_in_the_recipe(tmp_path: Path, urdf: str | bytes, message: str) -> None:
+    with pytest.raises(RecipeError, match=rf"robot.urdf.*{message}"):
+        load(problem_with(tmp_path, urdf))
+
+
+def test_so_it_is_in_the_record_of_a_problem() -> None:
+    record = record_problem(SHIPPED)
+    long = type(record)(record.recipe, chain(5000))
+    with pytest.raises(RecipeError, match="it has 5,001 links"):
+        open_problem(long)
+    with pytest.raises(ValueError, match="it has 5,001 links"):
+        _ = long.held_joints
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+    path = problem_with(tmp_path, "")
+    with (tmp_path / "robot.urdf").open("wb") as file:
+        file.truncate(MOST_BYTES + 1)
+    with pytest.raises(RecipeError, match="has 8,388,609 bytes, expected a URDF of at most 8,388,608"):
+        load(path)
+
+
+@pytest.mark.parametrize("what", ["device", "pipe", "folder", "nothing"])
+def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
+    path = problem_with(tmp_path, "")
+    (tmp_path / "robot.urdf").unlink()
+    if what == "device":
+        (tmp_path / "robot.urdf").symlink_to("/dev/zero")
+    elif what == "pipe":
+        os.mkfifo(tmp_path / "robot.urdf")
+    elif what == "folder":
+        (tmp_path / "robot.urdf").mkdir()
+    with pytest.raises(RecipeError, match=r"robot.urdf: no such file: .*robot.urdf"):
+        load(path)
+    with pytest.raises(RecipeError, match=rf"robot.urdf: {'no such file' if what == 'nothing' else 'not a file'}"):
+        read_urdf(tmp_path / "robot.urdf")
+
+
+def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
+    mimic = '<mimic joint="other" offset="0,5"/>'
+    finger = (
+        f'<link name="f"/><joint name="finger" type="revolute"><parent link="iiwa_link_1"/><child link="f"/>{LIMIT}'
+    )
+    link = SHIPPED.urdf_text.split('<link name="')[1].split('"')[0]
+    urdf = shipped_with(("</robot>", f"{finger.replace('iiwa_link_1', link)}{mimic}</joint></robot>"))
+    with pytest.raises(RecipeError, match=r"'finger' mimics 'other' with offset='0,5' must be a number"):
+        load(problem_with(tmp_path, urdf))
+
+
+def test_a_link_may_have_the_name_of_its_joint(tmp_path: Path) -> None:
+    """The tip is the frame of the link; the numbers are those of the robot whose names differ."""
+    usual = load_robot(SHIPPED)
+    last, joint = SHIPPED.robot.tip, usual.model.frames[usual.tip_frame].name
+    assert joint == last
+    names = [part.split('"')[0] for part in SHIPPED.urdf_text.split('<joint name="')[1:]]
+    fixed = next(name for name in reversed(names) if name not in SHIPPED.robot.joints)
+    problem = load(problem_with(tmp_path, shipped_with((f'<joint name="{fixed}"', f'<joint name="{last}"'))))
+    robot = load_robot(problem)
+    worlds = [World(each, SHIPPED.obstacle, SHIPPED.object_size) for each in (usual, robot)]
+    q = np.linspace(-0.5, 0.5, 7)
+    for world in worlds:
+        world.set_state(q, q, q, np.zeros(2))
+    np.testing.assert_array_equal(worlds[0].tip_position, worlds[1].tip_position)
+    assert usual.skeleton == robot.skeleton
+
+
+def test_a_link_may_have_the_name_of_any_joint(tmp_path: Path) -> None:
+    """Of joints that are held still, too, without which Pinocchio reduces the model."""
+    shipped = load_problem("airhockey")
+    there = replace(shipped.robot, urdf="robot.urdf")
+    usual, urdf = load_robot(shipped), shipped.urdf_text
+    links = [part.split('"')[0] for part in urdf.split('<link name="')[1:]]
+    for joint in (part.split('"')[0] for part in urdf.split('<joint name="')[1:]):
+        if joint in shipped.robot.joints:
+            continue
+        for link in links:
+            text = urdf.replace(f'<joint name="{joint}"', f'<joint name="{link}"', 1)
+            problem = replace(shipped, path=problem_with(tmp_path, text), robot=there)
+            robot = load_robot(problem)
+            assert robot.skeleton == usual.skeleton
+            np.testing.assert_array_equal(robot.chain.tip_translation, usual.chain.tip_translation)
+
+
+def test_a_tree_as_deep_as_robots_are_is_read() -> None:
+    inside = "<x>" * (MOST_DEPTH - 1) + "</x>" * (MOST_DEPTH - 1)
+    assert urdf_tree(f"<robot>{inside}</robot>").tag == "robot"
+    assert pin.buildModelFromXML(chain(1000 - 1)).nframes == 2 * 999 + 2

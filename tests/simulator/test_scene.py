@@ -1,0 +1,87 @@
+"""The simulated arm is the URDF's: its dynamics are Pinocchio's, and it keeps its energy where nothing brakes it."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.simulator import hockey
+from cnpgen.simulator.plant import PLANTS, Plant
+from cnpgen.simulator.scene import Scene, scene_xml
+from tests.examples.plans import PROBLEMS, ROBOTS
+
+mujoco = pytest.importorskip("mujoco")
+
+
+def scene(name: str, plant: Plant = PLANTS["nominal"]) -> Scene:
+    return Scene(PROBLEMS[name], ROBOTS[name], plant, np.full(len(PROBLEMS[name].obstacle), -1.0))
+
+
+def without_friction(name: str, step: float = 1e-4) -> "mujoco.MjModel":
+    model = mujoco.MjModel.from_xml_string(scene_xml(scene(name)))
+    model.dof_damping[:], model.dof_frictionloss[:], model.opt.timestep = 0, 0, step
+    return model
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_inverse_dynamics_and_tip_are_those_of_pinocchio(name: str) -> None:
+    robot, model = ROBOTS[name], without_friction(name)
+    data, other = mujoco.MjData(model), robot.model.createData()
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        q = random.uniform(robot.position_lower, robot.position_upper)
+        dq, ddq = random.normal(size=(2, robot.n))
+        data.qpos[: robot.n], data.qvel[: robot.n], data.qacc[: robot.n] = q, dq, ddq
+        mujoco.mj_inverse(model, data)
+        np.testing.assert_allclose(data.qfrc_inverse[: robot.n], pin.rnea(robot.model, other, q, dq, ddq), atol=1e-9)
+        pin.framesForwardKinematics(robot.model, other, q)
+        tip = other.oMf[robot.model.getFrameId(robot.tip)]
+        np.testing.assert_allclose(data.site("tip").xpos, tip.translation, atol=1e-12)
+        np.testing.assert_allclose(data.site("tip").xmat.reshape(3, 3), tip.rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_falling_arm_keeps_its_energy(name: str) -> None:
+    robot, model = ROBOTS[name], without_friction(name)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    data, other = mujoco.MjData(model), robot.model.createData()
+    data.qpos[: robot.n] = robot.base + 0.3
+    first = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), np.zeros(robot.n))
+    mujoco.mj_step(model, data, 4000)
+    q, dq = data.qpos[: robot.n].copy(), data.qvel[: robot.n].copy()
+    assert pin.computeKineticEnergy(robot.model, other, q, dq) > 1  # it does fall
+    assert pin.computeMechanicalEnergy(robot.model, other, q, dq) == pytest.approx(first, abs=1e-5)
+
+
+def test_friction_takes_energy_from_a_falling_arm() -> None:
+    robot = ROBOTS["airhockey"]
+    model = mujoco.MjModel.from_xml_string(scene_xml(scene("airhockey")))
+    data, other = mujoco.MjData(model), robot.model.createData()
+    data.qpos[: robot.n] = robot.base + 0.3
+    first = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), np.zeros(robot.n))
+    mujoco.mj_step(model, data, 1600)
+    last = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), data.qvel[: robot.n].copy())
+    assert last < first - 0.1
+
+
+def test_a_heavier_plant_has_a_tenth_more_mass() -> None:
+    mass = {
+        name: mujoco.MjModel.from_xml_string(scene_xml(scene("heavy-object", PLANTS[name]))).body_mass.sum()
+        for name in ("nominal", "heavier")
+    }
+    moving = sum(joint.mass for joint in ROBOTS["heavy-object"].chain.joints)
+    assert mass["nominal"] == pytest.approx(moving, rel=1e-12)
+    assert mass["heavier"] == pytest.approx(1.1 * moving, rel=1e-12)
+
+
+@pytest.mark.parametrize("restitution", [0.5, 0.75, 0.95])
+def test_a_bounce_is_as_strong_as_it_was_asked_to_be(restitution: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The puck meets a band, which cannot move: it comes back with so many times its speed, ten steps long."""
+    k, b = hockey.bounce(restitution)
+    monkeypatch.setattr(hockey, "bounce", lambda: (k, b))
+    hit = Scene(PROBLEMS["airhockey"], ROBOTS["airhockey"], PLANTS["nominal"], np.empty(0), np.zeros(2))
+    model = mujoco.MjModel.from_xml_string(scene_xml(hit))
+    model.dof_damping[-2:] = 0
+    data = mujoco.MjData(model)
+    data.qpos[-2:], data.qvel[-2:] = (1.5, hockey.WIDTH / 2 - hockey.PUCK_RADIUS - 0.05), (0.0, 2.0)
+    mujoco.mj_step(model, data, 400)
+    assert -data.qvel[-1] == pytest.approx(2.0 * restitution, abs=0.07)

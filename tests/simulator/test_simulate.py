@@ -1,0 +1,160 @@
+"""Hits that score, that miss the goal and that miss the puck; objects carried, and dragged through a pedestal."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.plans import Plans, make_plans
+from cnpgen.plans.concatenate import concatenate
+from cnpgen.refine.plans import solve_plans
+from cnpgen.schema.catalogue import list_recipes
+from cnpgen.simulator.execute import execute
+from cnpgen.simulator.plant import PLANTS, as_plant
+from cnpgen.simulator.reference import TICK, Reference
+from cnpgen.simulator.simulate import execute_plan, simulate_plans
+from tests.examples.plans import ROBOTS, load
+
+pytest.importorskip("mujoco")
+
+
+def straight(folder: Path, target: str) -> Plans:
+    """A valid hit that sends its puck exactly towards a place."""
+    recipe = (list_recipes("pipeline")["airhockey-hit"]).read_text(encoding="utf-8")
+    path = folder / "pipeline.toml"
+    path.write_text(recipe.replace("0.3 rad", "0 rad").replace("[2.49, 0] m", target), encoding="utf-8")
+    found = solve_plans(draw_boundary_problems(path, 1, seed=3), workers=1)
+    assert found.valid.all()
+    return found.plans
+
+
+@pytest.fixture(scope="module")
+def hit(tmp_path_factory: pytest.TempPathFactory) -> Plans:
+    return straight(tmp_path_factory.mktemp("hit"), "[2.49, 0] m")
+
+
+def stored(label: str) -> Plans:
+    plan = load(label)
+    return make_plans(
+        plan.problem, plan.boundary, path_control_points=plan.motion.path, rate_control_points=plan.motion.rate
+    )
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_a_valid_hit_scores_on_every_plant(hit: Plans, plant: str) -> None:
+    (executed,) = simulate_plans(hit, plant=plant, workers=1).executed
+    assert executed.success
+    assert executed.hit
+    assert executed.scored
+    assert executed.finished
+    assert not executed.touched_early
+    assert executed.z_error < 1e-3
+    assert executed.hit_time == pytest.approx(float(hit.duration[0]), abs=0.02)
+    assert executed.torque_use < 1
+
+
+def test_a_hit_that_is_03_rad_off_hits_and_does_not_score(tmp_path: Path) -> None:
+    plan = straight(tmp_path, "[2.49, 0.47] m")
+    goal, (velocity, _, _) = plan.columns["goal_xyz"][0], np.array([2.49, 0.0, 0.16]) - plan.columns["goal_xyz"][0]
+    (executed,) = simulate_plans(plan, workers=1).executed
+    off = np.arctan2(0.47 - goal[1], 2.49 - goal[0]) - np.arctan2(-goal[1], velocity)
+    assert off == pytest.approx(0.3, abs=0.05)
+    assert executed.finished
+    assert executed.hit
+    assert not executed.scored
+    assert not executed.success
+
+
+def raised(reference: Reference, height: float) -> Reference:
+    """The same motion with the arm lifted: the tip passes over the puck."""
+    lifted = reference.q.copy()
+    lifted[:, 3] += height
+    return replace(reference, q=lifted)
+
+
+def test_a_motion_5_cm_too_high_misses_the_puck(hit: Plans) -> None:
+    scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
+    goal = hit.columns["goal_xyz"][0]
+    for turn in (-0.08, 0.08):
+        found = execute(scene, raised(reference, turn), goal)
+        if found.tip[reference.ticks, 2] > execution.tip[reference.ticks, 2] + 0.05:
+            assert not found.executed.hit
+            assert not found.executed.scored
+            return
+    raise AssertionError("neither way lifts the tip by 5 cm")
+
+
+def test_a_puck_in_the_way_is_touched_early(hit: Plans) -> None:
+    scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
+    goal = hit.columns["goal_xyz"][0]
+    halfway = execution.tip[reference.ticks // 2, :2]
+    executed = execute(replace(scene, puck=halfway), reference, goal).executed
+    assert executed.hit
+    assert executed.touched_early
+    assert not executed.success
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_an_object_is_carried_without_collision(plant: str) -> None:
+    (executed,) = simulate_plans(stored("transport"), plant=plant, workers=1).executed
+    assert executed.success
+    assert executed.finished
+    assert executed.collided is False
+    assert executed.hit is None
+    assert 0 < executed.vertical_error < 0.05
+    assert executed.torque_use < 1
+
+
+def test_an_object_dragged_through_a_pedestal_collides() -> None:
+    scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
+    higher = replace(scene, tops=scene.tops + 0.1)
+    executed = execute(higher, reference, stored("transport").columns["goal_xyz"][0]).executed
+    assert executed.collided
+    assert not executed.success
+
+
+def test_two_processes_execute_as_one_does(hit: Plans) -> None:
+    plans = concatenate([hit] * 3)
+    one, two = (simulate_plans(plans, workers=workers).executed for workers in (1, 2))
+    assert [each.to_dict() for each in one] == [each.to_dict() for each in two]
+    assert one[0].to_dict() == one[2].to_dict()  # nothing of a plan is left in the world of the next
+
+
+def test_a_plan_that_is_none_is_not_executed_and_the_others_are(hit: Plans) -> None:
+    good = hit
+    bad = replace(good, rate_control_points=-good.rate_control_points)
+    found = simulate_plans(concatenate([bad, good]), workers=1)
+    assert "cannot be executed" in found.executed[0].failure
+    assert not found.executed[0].success
+    assert found.executed[1].success
+    assert found.summary()["success"] == 1
+    assert found.summary()["plans"] == 2
+
+
+def test_an_unknown_plant_is_refused_by_name() -> None:
+    with pytest.raises(UsageError, match=r"unknown plant 'heavyer'.*did you mean 'heavier'"):
+        as_plant("heavyer")
+
+
+def test_the_robot_stops_after_a_hit_within_its_limits(hit: Plans) -> None:
+    _, reference, _ = execute_plan(hit, PLANTS["nominal"])
+    limit = ROBOTS["airhockey"].acceleration_limit
+    after = slice(reference.ticks, None)
+    assert np.abs(reference.dq[-1]).max() == 0
+    assert np.all(np.abs(reference.ddq[after]) <= limit * (1 + 1e-12))
+    step = np.diff(reference.q, axis=0) - TICK * (reference.dq[1:] + reference.dq[:-1]) / 2
+    assert np.abs(step).max() < 1e-5  # positions and velocities belong together, across the end of the plan as well
+
+
+def test_where_a_torque_saturates_the_arm_is_still_held_up() -> None:
+    """A jump of a tenth of a radian asks for more than the motors have; the robot arrives, late, and does not fall."""
+    scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
+    q = np.vstack([reference.q[-1:] - 0.1, np.repeat(reference.q[-1:], 2000, axis=0)])
+    jump = Reference(q, np.zeros_like(q), np.zeros_like(q), 2.0)
+    away = replace(scene, tops=scene.tops - 2)
+    found = execute(away, jump, stored("transport").columns["goal_xyz"][0])
+    assert found.executed.torque_use == pytest.approx(1)
+    assert found.executed.finished
