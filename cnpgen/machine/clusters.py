@@ -233,7 +233,7 @@ def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluste
         here: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
         try:
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **here)
-        except (OSError, ValueError, RuntimeError) as error:
+        except Exception as error:
             raise MachineError(f"cannot reach {what}: {' '.join(str(error).split())}") from error
     try:
         yield _Ray(what, workers)

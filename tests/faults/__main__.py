@@ -12,30 +12,16 @@ def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--inputs", metavar="N", type=int, default=0, help="changed files to read")
-    parser.add_argument(
-        "--kills", metavar="N", type=int, default=0, help="processes to kill; what they did is started again"
-    )
+    parser.add_argument("--kills", metavar="N", type=int, default=0, help="processes to kill; their runs go on")
     parser.add_argument("--seed", metavar="S", type=int, default=0, help="seed of everything")
-    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input, or kill")
+    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input or run")
     parser.add_argument("--kind", choices=tuple(SUBJECTS), action="append", help="only files of this kind")
     arguments = parser.parse_args()
-    findings = [*_killed(arguments)] if arguments.kills else []
-    findings += _changed(arguments) if arguments.inputs else []
-    print(f"{len(findings)} findings", *findings, sep="\n")
-    return 1 if findings else 0
+    return max(inputs(arguments) if arguments.inputs else 0, kills(arguments) if arguments.kills else 0)
 
 
-def _killed(arguments: argparse.Namespace) -> list[str]:
-    """Kill processes, print what they were, and return what went wrong."""
-    killed = kill(arguments.kills, seed=arguments.seed, first=arguments.first)
-    for what, count in sorted(killed.runs.items()):
-        print(f"{count:>6,} {what}")
-    print(f"{killed.struck:>6,} processes struck")
-    return [str(each) for each in killed.findings]
-
-
-def _changed(arguments: argparse.Namespace) -> list[str]:
-    """Read changed files, print how many were refused, and return what went wrong."""
+def inputs(arguments: argparse.Namespace) -> int:
+    """Read changed files."""
     outcome = fuzz(
         arguments.inputs,
         seed=arguments.seed,
@@ -45,7 +31,21 @@ def _changed(arguments: argparse.Namespace) -> list[str]:
     )
     for kind in SUBJECTS:
         print(f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused")
-    return [str(each) for each in outcome.findings]
+    return _told(outcome.findings)
+
+
+def kills(arguments: argparse.Namespace) -> int:
+    """Kill processes."""
+    killed = kill(arguments.kills, seed=arguments.seed, first=arguments.first)
+    for what, count in sorted(killed.runs.items()):
+        print(f"{count:>6,} {what}")
+    print(f"{killed.struck:>6,} processes struck")
+    return _told(killed.findings)
+
+
+def _told(findings: list[str]) -> int:
+    print(f"{len(findings)} findings", *findings, sep="\n")
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":
