@@ -1,4 +1,4 @@
-"""Faults in large numbers: ``python -m tests.faults --kills 200 --inputs 100000``; the exit code is 1 if any is found."""
+"""Faults in large numbers: ``python -m tests.faults --kills 200 --inputs 100000``; exit code 1 if any is found."""
 
 import argparse
 import sys
