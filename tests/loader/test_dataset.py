@@ -84,7 +84,7 @@ def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
 
 
 def test_a_dataset_that_does_not_say_its_problem_is_refused(dataset: Dataset) -> None:
-    with pytest.raises(DatasetError, match="two-shards does not say its problem: pipeline.problem is missing"):
+    with pytest.raises(DatasetError, match=r"two-shards does not say its problem: pipeline\.problem is missing"):
         _ = dataset.problem
 
 
