@@ -39,7 +39,7 @@ def test_a_peak_between_any_two_moments_of_a_grid_is_found() -> None:
     at = 1 / np.pi
     rows = np.array([[[2 - at**2, 2 - at**2 + at, 2 - (1 - at) ** 2]]])  # 2 - (s - at)^2 in Bernstein form
     found, row, s = largest(rows, np.array([0.0, 1.0]))
-    assert (found, row, s) == (pytest.approx(2, abs=ROUGH), 0, pytest.approx(at, abs=0.03))
+    assert (found, row, s) == (pytest.approx(2, abs=ROUGH), 0, pytest.approx(at, abs=0.1))
 
 
 @pytest.mark.parametrize("top", [1 + 2 * CLOSE, 1 - 1e-9])

@@ -17,9 +17,10 @@ from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spline import derivative
 
 Array = NDArray[np.float64]
+Peak = tuple[float, int, float]  # value, of which function, at which phase
 
 CLOSE = 1e-6  # how far below the largest value the one that is found may be, where that decides whether it is above 1
-ROUGH = 1e-3  # the same elsewhere
+ROUGH = 1e-2  # the same elsewhere
 HALVINGS = 40  # at most: pieces are then shorter than a picosecond
 
 
@@ -50,35 +51,38 @@ def polynomials(motion: Motion) -> Pieces:
     return Pieces(edges, q=p, dq=_product(p1, r), ddq=_product(_product(p2, r) + _product(p1, r1), r))
 
 
-def largest(rows: Array, edges: Array) -> tuple[float, int, float]:
+def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0)) -> Peak:
     """Find the largest value of piecewise polynomials to within ``ROUGH``, and whether it is above 1 to ``CLOSE``.
 
     Args:
         rows: Bernstein coefficients of M functions, finite, shape (M, S, d + 1).
         edges: Phases between which they are polynomials, shape (S + 1,).
+        known: A value that is attained, as returned.
 
     Returns:
         ``(value, row, s)``: the largest value that is attained, of which function, at which phase.
     """
-    count, spans, size = rows.shape
-    pieces = rows.reshape(-1, size)
-    of_row = np.repeat(np.arange(count), spans)
-    left, width = np.tile(edges[:-1], count), np.tile(np.diff(edges), count)
-    best, at = -np.inf, (0, 0.0)
+    best, *at = known
+    of_row, span = np.nonzero(_worth_halving(rows.max(axis=2), best))
+    pieces, left, width = rows[of_row, span], edges[span], np.diff(edges)[span]
     for _ in range(HALVINGS):
+        if not len(pieces):
+            break
+        width = np.tile(width / 2, 2)
+        of_row, left = np.tile(of_row, 2), np.concatenate([left, left + width[: len(left)]])
+        pieces = np.concatenate([pieces @ half for half in _halving(rows.shape[2])])
         for k, s in ((0, left), (-1, left + width)):
             top = int(np.argmax(pieces[:, k]))
             if pieces[top, k] > best:
-                best, at = float(pieces[top, k]), (int(of_row[top]), float(s[top]))
-        hull = pieces.max(axis=1)
-        open_ = hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH)
-        if not open_.any():
-            break
-        pieces, of_row, left, width = pieces[open_], of_row[open_], left[open_], width[open_] / 2
-        first, second = _halving(size)
-        pieces = np.concatenate([pieces @ first, pieces @ second])
-        of_row, left, width = np.tile(of_row, 2), np.concatenate([left, left + width]), np.tile(width, 2)
-    return best, *at
+                best, *at = float(pieces[top, k]), int(of_row[top]), float(s[top])
+        kept = _worth_halving(pieces.max(axis=1), best)
+        pieces, of_row, left, width = pieces[kept], of_row[kept], left[kept], width[kept]
+    return best, int(at[0]), at[1]
+
+
+def _worth_halving(hull: Array, best: float) -> NDArray[np.bool_]:
+    """Find pieces whose largest coefficients could hide more than is known."""
+    return np.asarray(hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH))
 
 
 @cache

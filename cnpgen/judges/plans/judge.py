@@ -184,13 +184,17 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
 
 def _margins(survey: Survey) -> list[Margin]:
     """Measure every constraint, at the samples and between them; the survey's world is moved."""
+    pieces, margins = polynomials(survey.motion), []
+    proven = {
+        id(each): limit_margin(each, survey.world, pieces, survey.samples.s, survey.table)
+        for each in survey.problem.constraint
+        if is_proven(each)
+    }
     worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
     for each, margin in chain(look_closer(survey), look_at_peaks(survey)):
         worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
-    pieces, margins = polynomials(survey.motion), []
     for constraint in survey.problem.constraint:
-        if is_proven(constraint):
-            margins.append(limit_margin(constraint, survey.world, pieces, survey.table))
+        margins += [proven[id(constraint)]] if id(constraint) in proven else []
         margins += [worst[id(each)] for each in survey.measured if each.constraint is constraint]
     return margins
 

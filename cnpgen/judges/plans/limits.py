@@ -26,20 +26,24 @@ def is_proven(constraint: Constraint) -> bool:
     return type(constraint) in _COEFFICIENTS
 
 
-def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, table: Array) -> Margin:
+def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, s: Array, table: Array) -> Margin:
     """Find where a motion comes closest to breaking a joint limit, or breaks it most.
 
     Args:
         constraint: One that ``is_proven``.
         world: The robot at the samples.
         pieces: The motion as polynomials.
+        s: Phases of the samples, shape (K,).
         table: Times of the motion at ``table_phases()`` [s].
     """
     (condition,) = constraint.measured(cast("World", world))
     allowed = constraint.allowed(condition)
     scale = np.maximum(allowed, LEAST * np.maximum(np.abs(condition.lower), np.abs(condition.upper)))
     coefficients: Array = getattr(pieces, _COEFFICIENTS[type(constraint)])
-    share, row, s = largest(_beyond(coefficients, condition, scale), pieces.edges)
+    sampled = _beyond(np.array(condition.g)[:, None], condition, scale)[:, 0]
+    row, k = divmod(int(np.argmax(sampled)), len(s))
+    known = float(sampled[row, k]), row, float(s[k])
+    share, row, phase = largest(_beyond(coefficients, condition, scale), pieces.edges, known)
     low, part = row < len(scale), row % len(scale)
     excess, bound = share * scale[part], (condition.lower if low else condition.upper)[part]
     return Margin(
@@ -51,8 +55,8 @@ def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, table
         bound=float(bound),
         excess=float(excess),
         allowed=float(allowed[part]),
-        time=float(np.interp(s, table_phases(), table)),
-        phase=s,
+        time=float(np.interp(phase, table_phases(), table)),
+        phase=phase,
     )
 
 

@@ -21,7 +21,7 @@ Indices = NDArray[np.intp]
 
 CAUTION = 4.0  # times the parabola's height: third derivatives are not looked at
 CLOSE = 1e-7  # of what is allowed: less is not looked for where it decides whether more is exceeded than that
-ROUGH = 1e-3  # the same elsewhere
+ROUGH = 1e-2  # the same elsewhere
 ROUNDS = 24  # at most; a smooth maximum takes three, a kink one per halving
 MOST = 64  # maxima of all conditions that are looked into
 
