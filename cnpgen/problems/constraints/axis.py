@@ -3,13 +3,14 @@
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint, End
-from cnpgen.problems.constraints.tip_manifold import along, beside, unit
+from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +30,14 @@ class TipAxis(Constraint):
 
     @property
     @abstractmethod
-    def directions(self) -> tuple[Array, Array]:
-        """The axis in the tip's frame and the direction in the world, unit vectors."""
+    def directions(self) -> tuple[list[float], list[float]]:
+        """The axis in the tip's frame and the direction in the world, unit vectors; kinds keep them."""
+
+    @cached_property
+    def across(self) -> list[list[float]]:
+        """Two unit vectors of the world orthogonal to the direction."""
+        found: list[list[float]] = beside(np.array(self.directions[1])).tolist()
+        return found
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tilt [rad]."""
@@ -44,7 +50,7 @@ class TipAxis(Constraint):
     def _held(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
         axis, direction = self.directions
         pointing = [along(axis, row) for row in rotation]
-        tilt = [along(row, pointing) for row in beside(direction)]
+        tilt = [along(row, pointing) for row in self.across]
         upright = [along(direction, pointing)]
         return (
             Condition("tilt", "rad", tilt, np.zeros(2), np.zeros(2), "angle", ("x", "y")),
@@ -71,10 +77,10 @@ class Axis(TipAxis):
         unit(self.axis, "axis")
         unit(self.direction, "direction")
 
-    @property
-    def directions(self) -> tuple[Array, Array]:
+    @cached_property
+    def directions(self) -> tuple[list[float], list[float]]:
         """The axis in the tip's frame and the direction in the world, unit vectors."""
-        return unit(self.axis, "axis"), unit(self.direction, "direction")
+        return unit(self.axis, "axis").tolist(), unit(self.direction, "direction").tolist()
 
     def allowed(self, condition: Condition) -> Array:
         """Return how far a motion may be outside: the cosine's share of the tolerance where there is an angle."""
@@ -108,11 +114,11 @@ class Axis(TipAxis):
 
     def _resting(self, rotation: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
         """Return how fast the axis u turns away from the direction: ``w x u`` and ``a x u + w x (w x u)`` across it."""
-        axis, direction = self.directions
+        axis, _ = self.directions
         u = [along(axis, row) for row in rotation]
         rate = _cross(omega, u)
         second = [a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)]
-        zero, rows = np.zeros(2), beside(direction)
+        zero, rows = np.zeros(2), self.across
         return (
             Condition("tilt rate", "rad/s", [along(row, rate) for row in rows], zero, zero, "velocity"),
             Condition("tilt acceleration", "rad/s^2", [along(row, second) for row in rows], zero, zero, "acceleration"),

@@ -1,13 +1,12 @@
 """The tip on a line of any direction, or on a piece of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from cnpgen.problems.constraints.tip_manifold import FUNNEL, Place, TipManifold, beside, unit
+from cnpgen.problems.constraints.tip_manifold import FUNNEL, Place, TipManifold, Vector, beside, unit
 from cnpgen.schema.keys import Range, field
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +31,12 @@ class Line(TipManifold):
         """
         unit(self.direction, "direction")
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """The line."""
         direction = unit(self.direction, "direction")
-        ranges = (self.piece,) if self.piece else ()
-        return Place(np.array(self.point), beside(direction), direction[None][: len(ranges)], ranges)
+        bounded, ranges = ([direction.tolist()], (self.piece,)) if self.piece else ((), ())
+        return Place(np.array(self.point), beside(direction).tolist(), bounded, ranges)
 
     @property
     def band(self) -> float:

@@ -1,14 +1,13 @@
 """The tip in a plane of any direction, or in a rectangle of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.tip_manifold import FUNNEL, Place, TipManifold, beside, unit
+from cnpgen.problems.constraints.tip_manifold import FUNNEL, Place, TipManifold, Vector, beside, unit
 from cnpgen.schema.keys import Range, field
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,13 +36,13 @@ class Plane(TipManifold):
             raise ValueError("u and v need a direction in the plane that u is measured along: along = [1, 0, 0]")
         self._axes()
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """The plane."""
         normal, axes = self._axes()
         given = [(axis, each) for axis, each in zip(axes, (self.u, self.v), strict=True) if each]
-        bounded = np.array([axis for axis, _ in given]).reshape(-1, 3)
-        return Place(np.array(self.point), normal[None], bounded, tuple(each for _, each in given))
+        bounded = [axis.tolist() for axis, _ in given]
+        return Place(np.array(self.point), [normal.tolist()], bounded, tuple(each for _, each in given))
 
     @property
     def band(self) -> float:

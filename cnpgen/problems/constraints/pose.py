@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,14 +36,14 @@ class Pose(TipManifold):
     z: Range | None = field("where the tip may be along world z", unit="m", default=None)
     tolerance: float = field("how far a motion may turn [rad] or be off [m] and still be called valid", low=1e-9)
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """The box, and in which directions it has no width."""
         given = [(row, each) for row, each in zip(np.eye(3), (self.x, self.y, self.z), strict=True) if each]
         held = [(row, each.low) for row, each in given if each.low == each.high]
         free = [(row, each) for row, each in given if each.low < each.high]
         point = sum((row * value for row, value in held), start=np.zeros(3))
-        rows = [np.array([row for row, _ in given]).reshape(-1, 3) for given in (held, free)]
+        rows = [[row.tolist() for row, _ in pairs] for pairs in (held, free)]
         return Place(point, held=rows[0], bounded=rows[1], ranges=tuple(each for _, each in free))
 
     @property

@@ -1,6 +1,7 @@
 """The table manifold: the tip stays over a rectangle at one height (paper, Appendix B, loss of the hitting task)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,10 +27,10 @@ class Table(TipManifold):
     start_band: float = field("how far above or below a motion may start", unit="m", default=0.0, low=0.0)
     tolerance: float = field("how far a motion may be off and still be called valid", unit="m", low=1e-9)
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """The rectangle."""
-        axes = np.eye(3)
+        axes = np.eye(3).tolist()
         return Place(np.array([0.0, 0.0, self.z]), held=axes[2:], bounded=axes[:2], ranges=(self.x, self.y))
 
     @property

@@ -8,6 +8,7 @@ table).
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Vectors = Sequence[Sequence[float]]  # numbers of Python, which are multiplied with one at a time
 FUNNEL = (0.1, 0.3)  # phases between which a motion that starts off the manifold must come to it
 
 
@@ -30,15 +33,27 @@ class Place:
 
     Attributes:
         point: A point of the manifold [m], shape (3,).
-        held: Unit vectors along which the tip stays at the point, shape (k, 3).
-        bounded: Unit vectors along which it stays in a range, shape (m, 3), orthogonal to the others.
+        held: Unit vectors along which the tip stays at the point, k of them.
+        bounded: Unit vectors along which it stays in a range, m of them, orthogonal to the others.
         ranges: Those ranges, measured from the point [m], m of them.
     """
 
     point: Array
-    held: Array
-    bounded: Array
+    held: Vectors
+    bounded: Vectors = ()
     ranges: tuple[Range, ...] = ()
+
+    @cached_property
+    def height(self) -> Array:
+        """Where the tip is held along each of ``held``, measured from the world's origin [m], shape (k,)."""
+        return np.asarray(np.array(self.held) @ self.point)
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Between which it stays along each of ``bounded``, measured likewise [m], shape (m,) each."""
+        origin = np.array(self.bounded) @ self.point
+        low, high = (np.array([getattr(each, end) for each in self.ranges]) for end in ("low", "high"))
+        return origin + low, origin + high
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +69,7 @@ class TipManifold(Constraint):
     @property
     @abstractmethod
     def place(self) -> Place:
-        """Where the tip must be."""
+        """Where the tip must be; kinds keep it, since it is asked for at every state."""
 
     @property
     def band(self) -> float:
@@ -93,21 +108,20 @@ class TipManifold(Constraint):
             start_tip: Positions of the tip at the start [m], shape (..., 3).
         """
         place = self.place
-        off = np.stack([np.abs(along(row, start_tip.T).T - row @ place.point) for row in place.held])
+        pairs = zip(place.held, place.height, strict=True)
+        off = np.stack([np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
         return np.asarray(np.minimum(off.max(axis=0), self.band))
 
     def _position(self, tip: Sequence[Any], band: float) -> tuple[Condition, ...]:
         place = self.place
         found = []
         if place.ranges:
-            origin = place.bounded @ place.point
-            low, high = (np.array([getattr(each, end) for each in place.ranges]) for end in ("low", "high"))
             g = [along(row, tip) for row in place.bounded]
-            found.append(Condition(self.inside_name, "m", g, origin + low, origin + high, "position", self.parts[0]))
-        if len(place.held):
-            origin = place.held @ place.point
+            found.append(Condition(self.inside_name, "m", g, *place.bounds, "position", self.parts[0]))
+        if place.held:
+            low, high = place.height - band, place.height + band
             g = [along(row, tip) for row in place.held]
-            found.append(Condition(self.held_name, "m", g, origin - band, origin + band, "position", self.parts[1]))
+            found.append(Condition(self.held_name, "m", g, low, high, "position", self.parts[1]))
         return tuple(found)
 
     def _band_at(self, end: End) -> float:
@@ -116,7 +130,7 @@ class TipManifold(Constraint):
     def _moving(self, velocity: Sequence[Any], acceleration: Sequence[Any]) -> tuple[Condition, ...]:
         """State that the tip moves along the manifold only."""
         held, parts = self.place.held, self.parts[1]
-        if not len(held):
+        if not held:
             return ()
         zero = np.zeros(len(held))
         rates = [[along(row, values) for row in held] for values in (velocity, acceleration)]
@@ -126,12 +140,14 @@ class TipManifold(Constraint):
         )
 
 
-def along(direction: Array, vector: Sequence[Any] | Array) -> Any:
+def along(direction: Sequence[float], vector: Sequence[Any] | Array) -> Any:
     """Return the component along a unit vector of a vector of SX scalars, numbers or arrays; no term is 0."""
-    terms = [
-        value if share == 1 else float(share) * value for share, value in zip(direction, vector, strict=True) if share
-    ]
-    return sum(terms[1:], start=terms[0])
+    total = None
+    for share, value in zip(direction, vector, strict=True):
+        if share:
+            term = value if share == 1 else share * value
+            total = term if total is None else total + term
+    return total
 
 
 def unit(vector: Sequence[float] | Array, what: str) -> Array:

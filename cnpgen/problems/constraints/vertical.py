@@ -1,9 +1,7 @@
 """The vertical-orientation manifold: the tip's z axis is the world's (paper, Appendix B, heavy object)."""
 
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from functools import cached_property
 
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.schema.keys import field
@@ -16,7 +14,7 @@ class Vertical(TipAxis):
     reason = "not vertical"
     tolerance: float = field("how far a motion may tilt and still be called valid", unit="rad", low=1e-9)
 
-    @property
-    def directions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    @cached_property
+    def directions(self) -> tuple[list[float], list[float]]:
         """Both z axes."""
-        return np.eye(3)[2], np.eye(3)[2]
+        return [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]
