@@ -7,6 +7,7 @@ height could matter, samples are added at the parabola's vertex and in the middl
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,18 @@ class _Brackets:
 
     def __getitem__(self, which: NDArray[np.bool_] | Indices) -> "_Brackets":
         return _Brackets(self.of[which], self.part[which], self.s[which], self.share[which])
+
+    @cached_property
+    def tops(self) -> tuple[Array, Array]:
+        """The phases of the parabolas' vertices and how high these are above the middle samples, shape (B,) each."""
+        (a, b, c), (fa, fb, fc) = self.s.T, self.share.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left, right = (fb - fa) / (b - a), (fb - fc) / (c - b)  # slopes down to both sides, not negative
+            bend = (left + right) / (c - a)
+            away = (left * (c - b) - right * (b - a)) / (2 * (left + right))
+            height = bend * away**2
+        good = np.isfinite(away) & np.isfinite(height)
+        return np.where(good, np.clip(b + np.where(good, away, 0.0), a, c), b), np.where(good, height, 0.0)
 
 
 def look_at_peaks(survey: Survey) -> Iterator[tuple[Measured, Margin]]:
@@ -89,7 +102,7 @@ def _maxima(s: Array, measured: Sequence[Measured]) -> _Brackets:
 def _promising(brackets: _Brackets, measured: Sequence[Measured]) -> _Brackets:
     """Keep maxima that could be the largest of their condition, where that could be beyond its bound."""
     largest = np.array([np.max(each.share, initial=-np.inf) for each in measured])
-    hope = brackets.share[:, 1] + CAUTION * _height(brackets)
+    hope = brackets.share[:, 1] + CAUTION * brackets.tops[1]
     worth = (hope >= largest[brackets.of]) & (hope > 0) if len(largest) else np.zeros(0, bool)
     kept = brackets[worth]
     return _worth(kept[np.argsort(-hope[worth], kind="stable")[:MOST]])
@@ -97,29 +110,13 @@ def _promising(brackets: _Brackets, measured: Sequence[Measured]) -> _Brackets:
 
 def _worth(brackets: _Brackets) -> _Brackets:
     """Keep those between whose samples something is left to gain."""
-    top, gain = brackets.share[:, 1], CAUTION * _height(brackets)
+    top, gain = brackets.share[:, 1], CAUTION * brackets.tops[1]
     return brackets[gain > np.where((top <= 1) & (top + gain > 1), CLOSE, ROUGH)]
-
-
-def _vertex(brackets: _Brackets) -> tuple[Array, Array]:
-    """Return the phases of the parabolas' vertices and how high these are above the middle samples."""
-    (a, b, c), (fa, fb, fc) = brackets.s.T, brackets.share.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        left, right = (fb - fa) / (b - a), (fb - fc) / (c - b)  # slopes down to both sides, not negative
-        bend = (left + right) / (c - a)
-        away = (left * (c - b) - right * (b - a)) / (2 * (left + right))
-        height = bend * away**2
-    good = np.isfinite(away) & np.isfinite(height)
-    return np.where(good, np.clip(b + np.where(good, away, 0.0), a, c), b), np.where(good, height, 0.0)
-
-
-def _height(brackets: _Brackets) -> Array:
-    return _vertex(brackets)[1]
 
 
 def _new_phases(brackets: _Brackets) -> Array:
     """Return three phases inside every bracket: the vertex and the middles of both sides, shape (B, 3)."""
-    vertex, _ = _vertex(brackets)
+    vertex, _ = brackets.tops
     middles = (brackets.s[:, 1:] + brackets.s[:, :-1]) / 2
     return np.column_stack([vertex, middles])
 
