@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.between import Pieces, largest
-from cnpgen.judges.plans.sampling import table_phases
+from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointVelocity
@@ -55,7 +55,7 @@ def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, s: Ar
         bound=float(bound),
         excess=float(excess),
         allowed=float(allowed[part]),
-        time=float(np.interp(phase, table_phases(), table)),
+        time=float(times(np.array([phase]), table)[0]),
         phase=phase,
     )
 

@@ -84,7 +84,12 @@ def sample(table: Array, step: float, spans: int, also: Collection[float] = ()) 
     by_time = np.interp(np.linspace(0, duration, count), table, phases)
     near = END * (np.arange(AT_ENDS + 1) / AT_ENDS) ** 2
     s = np.unique(np.concatenate([by_time, np.linspace(0, 1, PER_SPAN * spans + 1), near, 1 - near, list(also)]))
-    return Samples(s, np.interp(s, phases, table))
+    return Samples(s, times(s, table))
+
+
+def times(s: Array, table: Array) -> Array:
+    """Return when a motion is at phases s [s], shape (K,); ``table`` is what ``time_table`` returned."""
+    return np.interp(s, table_phases(), table)
 
 
 @cache

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.course import course
 from cnpgen.judges.plans.limits import is_proven
 from cnpgen.judges.plans.measure import Measured, measure
-from cnpgen.judges.plans.sampling import Samples, table_phases
+from cnpgen.judges.plans.sampling import Samples, times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem
@@ -52,13 +52,9 @@ class Survey:
         """Measure a constraint at phases s, shape (K,), to which the robot was moved."""
         return measure(constraint, self.world, s, self.start_tip)
 
-    def time(self, s: Array) -> Array:
-        """Return when the motion is at phases s [s]."""
-        return np.interp(s, table_phases(), self.table)
-
     def margin(self, found: Measured, s: Array) -> Margin:
         """Say where a condition that was measured at phases s is closest to being broken, or broken most."""
-        return found.margin(self.problem, Samples(s, self.time(s)))
+        return found.margin(self.problem, Samples(s, times(s, self.table)))
 
 
 def survey(  # noqa: PLR0917 - each of them is half of what is surveyed
