@@ -151,6 +151,6 @@ def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:
     """Velocity of the tip [m/s], shape (3,)."""
     import pinocchio as pin
 
-    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    data, frame = robot.model.createData(), robot.tip_frame
     J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
     return np.asarray(J[:3] @ dq)
