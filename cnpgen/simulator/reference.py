@@ -56,7 +56,7 @@ def states_of(motion: Motion) -> StatesAt:
     """Return what evaluates one motion in time."""
 
     def states(t: Array) -> tuple[Array, Array, Array]:
-        found = motion.at(motion.phase_at(t[None]))
+        found = motion.at_times(t[None])
         return found.q[0], found.dq[0], found.ddq[0]
 
     return states
