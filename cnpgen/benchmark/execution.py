@@ -7,13 +7,12 @@ from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.benchmark.turns import Lead
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem
-from cnpgen.simulator.execute import Execution, execute
+from cnpgen.simulator.execute import Execution
 from cnpgen.simulator.executed import Executed
 from cnpgen.simulator.plant import Plant
-from cnpgen.simulator.reference import Reference, StatesAt, make_reference, states_of
+from cnpgen.simulator.reference import Reference, StatesAt, states_of
 from cnpgen.simulator.scene import Scene
-from cnpgen.simulator.simulate import scene_of
+from cnpgen.simulator.simulate import execute_states
 
 Array = NDArray[np.float64]
 Task = tuple[Plans, Plans | Trajectory, Lead | None]
@@ -53,12 +52,9 @@ def execution_of(
         MachineError: MuJoCo is missing.
     """
     states, duration = _timed(answer)
-    if lead is not None:
-        states, duration = joined(lead, states), float(lead.until[0]) + duration
-    limit = open_problem(problem.problem)[1].acceleration_limit
-    reference, scene = make_reference(states, duration, acceleration_limit=limit), scene_of(problem, plant)
-    start_dq = problem.boundary.start_dq[0] if lead is None else None
-    return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0], start_dq)
+    if lead is None:
+        return execute_states(problem, states, duration, plant, problem.boundary.start_dq[0])
+    return execute_states(problem, joined(lead, states), float(lead.until[0]) + duration, plant)
 
 
 def joined(lead: Lead, states: StatesAt) -> StatesAt:

@@ -1,21 +1,23 @@
 """Pucks on a grid, and the boundary problems of hitting each of them towards the goal."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.kernels.library import choose_backend, problem_kernels
-from cnpgen.pipelines.context import Context
+from cnpgen.make.complete import complete
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.behind_puck import behind
+from cnpgen.pipelines.stages.given_positions import GivenPositions
+from cnpgen.pipelines.stages.hit_angle import HitAngleToGoal
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.stages.stage import Round
-from cnpgen.plans.boundary_problems import plans_of_rows
+from cnpgen.pipelines.stages.motion import TableAcceleration, TableVelocity
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.schema.keys import Range, field
 
@@ -68,22 +70,23 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     Raises:
         RecipeError: The problem has no table, or a puck cannot be hit.
     """
-    robot, problem = load_robot(pucks.problem), pucks.problem
+    problem = pucks.problem
     table = next((each for each in problem.constraint if isinstance(each, Table)), None)
     if table is None:
         raise RecipeError([f"pucks.problem: {problem.name} has no table to put pucks on"])
     way = np.array(pucks.goal)[:, None] - puck
-    along = way / np.linalg.norm(way, axis=0)
-    draws = Round(puck.shape[1])
-    draws["goal_xyz"] = np.vstack([puck - pucks.behind * along, np.full(draws.size, table.z)])
-    draws["hit_angle"] = np.arctan2(along[1], along[0])[None]
-    draws["start_q"] = np.ascontiguousarray(start[0].T)
-    context = Context(problem, robot, problem_kernels(problem, robot, *choose_backend(None)), "float64")
-    for stage in (HittingConfiguration(near="start"), HittingVelocity(full_speed=1.0)):
-        stage.prepare(context)(draws, np.random.default_rng(0))
-    if len(draws.alive) < draws.size:
-        raise RecipeError([f"pucks: {draws.size - len(draws.alive)} of {draws.size} cannot be hit"])
-    record, columns = record_problem(problem), {name: values.T for name, values in draws.columns.items()}
-    columns |= {"start_q": start[0], "start_dq": start[1], "start_ddq": start[2]}
-    columns |= {name: columns[name][:, 0] for name in ("hit_angle", "hit_speed")}
-    return plans_of_rows(record, {**columns, "start_xyz": record.tip_positions(start[0])}, source="pucks on a grid")
+    goal_xy = behind(puck, np.arctan2(way[1:], way[:1]), pucks.behind).T
+    stages = (
+        GivenPositions(goal=tuple((x, y, table.z) for x, y in goal_xy.tolist())),
+        TableVelocity(),
+        TableAcceleration(),
+        HitAngleToGoal(target=pucks.goal),
+        HittingConfiguration(near="start"),
+        HittingVelocity(full_speed=1.0),
+    )
+    pipeline = Pipeline(name="pucks", problem=problem, stage=stages, path=Path("pucks"))
+    columns = dict(zip(("start_q", "start_dq", "start_ddq"), start, strict=True))
+    found = complete(pipeline, goal_xyz=goal_xy, **columns)
+    if refused := sum(found.rejections.values()):
+        raise RecipeError([f"pucks: {refused} of {len(found.reasons)} cannot be hit"])
+    return replace(found.plans, source="pucks on a grid")

@@ -154,10 +154,10 @@ def _plan_all(results: Results, name: str, setting: Setting, problems: Plans, te
         return
     process = PlannerProcess(name, setting)
     try:
-        for index in waiting:
+        for done, index in enumerate(waiting, start=len(problems) - len(waiting) + 1):
             attempt = process.plan(problems[index])
             results.append(_row(index, problems[index], attempt))
-            tell(f"{name} plans", len(problems), len(problems) - len(waiting) + waiting.index(index) + 1)
+            tell(f"{name} plans", len(problems), done)
     finally:
         process.stop()
 

@@ -60,18 +60,12 @@ def turns_of(turns: Turns) -> tuple[Plans, Lead]:
     """
     first = solve_plans(hits_of(turns.pucks), workers=1).plans
     opposite = turns.pucks.positions()[:, ::-1]
-    problems, leads = [], []
+    problems = []
     for when in turns.when:
         if when >= first.duration.min():
             shortest = first.duration.min()
             raise RecipeError([f"turns.when: a first motion is over after {shortest:.3f} s, the turn is at {when:g} s"])
         problems.append(hits_from(turns.pucks, opposite, states_at(first, when)))
-        leads.append(Lead(first.motion, np.full(len(first), when)))
-    motions = [lead.motion for lead in leads]
-    motion = Motion(
-        np.concatenate([each.path for each in motions]), np.concatenate([each.rate for each in motions]), first.degree
-    )
-    joined = concatenate(problems)
-    return replace(joined, sample_id=np.arange(len(joined))), Lead(
-        motion, np.concatenate([lead.until for lead in leads])
-    )
+    joined, lead = concatenate(problems), concatenate([first] * len(problems)).motion
+    until = np.repeat(turns.when, len(first))
+    return replace(joined, sample_id=np.arange(len(joined))), Lead(lead, until)

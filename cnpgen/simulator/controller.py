@@ -5,6 +5,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.simulator.plant import Plant, rated_torque
 
@@ -20,6 +21,7 @@ class Controller:
     what holds the arm up comes first. It knows neither friction nor damping, nor what a plant has besides.
 
     Args:
+        problem: What the torques are rated at.
         robot: The robot as the controller believes it to be.
         plant: The robot as it is: how late torques take effect.
 
@@ -27,10 +29,10 @@ class Controller:
         limit: The rated torques [N m], shape (n,).
     """
 
-    def __init__(self, robot: Robot, plant: Plant) -> None:
+    def __init__(self, problem: Problem, robot: Robot, plant: Plant) -> None:
         self._model = robot.model
         self._data = robot.model.createData()
-        self.limit = rated_torque(robot)
+        self.limit = rated_torque(problem, robot)
         self._delay = plant.delay
         self._waiting: deque[Array] = deque()
 

@@ -101,7 +101,7 @@ class _Run:
         self._scene, self._reference, self._goal = scene, reference, goal_xyz
         self._model = compile_scene(scene)
         self._data = self._mujoco.MjData(self._model)
-        self._control = Controller(scene.robot, scene.plant)
+        self._control = Controller(scene.problem, scene.robot, scene.plant)
         self._n = scene.robot.n
         self._tip = self._model.site("tip").id
         self._seen: list[tuple[Array, ...]] = []

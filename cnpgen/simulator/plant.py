@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -81,13 +82,13 @@ def as_plant(plant: Plant | str) -> Plant:
     return PLANTS[plant]
 
 
-def joint_friction(robot: Robot) -> tuple[Friction, ...]:
+def joint_friction(problem: Problem, robot: Robot) -> tuple[Friction, ...]:
     """Return the friction of the planned joints: the iiwa's, or some by the rated torque."""
     if set(robot.joint_names) <= IIWA.keys():
         return tuple(IIWA[name] for name in robot.joint_names)
-    return tuple(Friction(DRY * rated, VISCOUS * rated) for rated in rated_torque(robot).tolist())
+    return tuple(Friction(DRY * rated, VISCOUS * rated) for rated in rated_torque(problem, robot).tolist())
 
 
-def rated_torque(robot: Robot) -> Array:
-    """Return the torque limits of the URDF, at which the simulated motors saturate [N m], shape (n,)."""
-    return np.array(robot.model.upperEffortLimit)
+def rated_torque(problem: Problem, robot: Robot) -> Array:
+    """Return the torque limits of the problem or else of the URDF, at which the motors saturate [N m], shape (n,)."""
+    return robot.torque_limit / problem.limits.torque_scale

@@ -39,24 +39,11 @@ class Reference:
         return int(np.ceil(self.duration / TICK)) + 1
 
 
-def reference_of(motion: Motion, *, acceleration_limit: Array) -> Reference:
-    """Sample one motion.
-
-    Args:
-        motion: One motion.
-        acceleration_limit: How fast joints are stopped after a plan that ends in motion [rad/s^2], shape (n,).
-
-    Raises:
-        UsageError: The plan never arrives, or takes longer than ``LONGEST``.
-    """
-    return make_reference(states_of(motion), float(motion.duration()[0]), acceleration_limit=acceleration_limit)
-
-
 def states_of(motion: Motion) -> StatesAt:
     """Return what evaluates one motion in time."""
 
     def states(t: Array) -> tuple[Array, Array, Array]:
-        found = motion.at(motion.phase_at(t[None]))
+        found = motion.at_times(t[None])
         return found.q[0], found.dq[0], found.ddq[0]
 
     return states
@@ -68,10 +55,10 @@ def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Arr
     Args:
         states: The trajectory.
         duration: How long it lasts [s].
-        acceleration_limit: As of ``reference_of``.
+        acceleration_limit: How fast joints are stopped after a plan that ends in motion [rad/s^2], shape (n,).
 
     Raises:
-        UsageError: As ``reference_of`` does.
+        UsageError: The plan never arrives, or takes longer than ``LONGEST``.
     """
     if not 0 < duration <= LONGEST:
         raise UsageError(f"a plan of {duration:g} s cannot be executed: expected more than 0 and at most {LONGEST:g} s")

@@ -91,7 +91,7 @@ def _arm(scene: Scene) -> Iterator[str]:
     chain, names = scene.robot.chain, scene.robot.joint_names
     ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
     for index, (joint, name, end, friction) in enumerate(
-        zip(chain.joints, names, ends, joint_friction(scene.robot), strict=True)
+        zip(chain.joints, names, ends, joint_friction(scene.problem, scene.robot), strict=True)
     ):
         kind = "slide" if joint.prismatic else "hinge"
         place = f'pos="{_numbers(joint.translation)}" quat="{_quaternion(joint.rotation)}"'

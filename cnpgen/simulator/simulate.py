@@ -20,7 +20,7 @@ from cnpgen.simulator.execute import Execution, execute, load_mujoco
 from cnpgen.simulator.executed import Executed
 from cnpgen.simulator.hockey import puck_of
 from cnpgen.simulator.plant import Plant, as_plant
-from cnpgen.simulator.reference import Reference, reference_of
+from cnpgen.simulator.reference import Reference, StatesAt, make_reference, states_of
 from cnpgen.simulator.scene import Scene
 
 Array = NDArray[np.float64]
@@ -125,10 +125,33 @@ def execute_plan(plan: Plans, plant: Plant) -> tuple[Scene, Reference, Execution
         RecipeError: As ``simulate_plans`` does.
         MachineError: Likewise.
     """
-    _, robot = open_problem(plan.problem)
-    reference = reference_of(plan.motion, acceleration_limit=robot.acceleration_limit)
-    scene = scene_of(plan, plant)
-    return scene, reference, execute(scene, reference, plan.columns["goal_xyz"][0])
+    return execute_states(plan, states_of(plan.motion), float(plan.duration[0]), plant)
+
+
+def execute_states(
+    problem: Plans, states: StatesAt, duration: float, plant: Plant, start_dq: Array | None = None
+) -> tuple[Scene, Reference, Execution]:
+    """Execute a trajectory for one boundary problem.
+
+    Args:
+        problem: One boundary problem, or a plan for it.
+        states: The trajectory.
+        duration: How long it lasts [s].
+        plant: The robot.
+        start_dq: As of ``execute``.
+
+    Returns:
+        As ``execute_plan`` does.
+
+    Raises:
+        UsageError: As ``execute_plan`` does.
+        RecipeError: Likewise.
+        MachineError: Likewise.
+    """
+    _, robot = open_problem(problem.problem)
+    reference = make_reference(states, duration, acceleration_limit=robot.acceleration_limit)
+    scene = scene_of(problem, plant)
+    return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0], start_dq)
 
 
 def scene_of(problem: Plans, plant: Plant) -> Scene:
@@ -151,6 +174,6 @@ def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:
     """Velocity of the tip [m/s], shape (3,)."""
     import pinocchio as pin
 
-    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tip)
+    data, frame = robot.model.createData(), robot.tip_frame
     J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
     return np.asarray(J[:3] @ dq)

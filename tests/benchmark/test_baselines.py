@@ -1,5 +1,7 @@
 """TrajOpt and AQP, each against something that shares no code with it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,6 +14,7 @@ from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.sst import Tree
+from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.planners.trajopt import TrajOpt, Transcription
 from cnpgen.benchmark.process import PlannerProcess
 from cnpgen.benchmark.suite import load_suite
@@ -157,6 +160,14 @@ def test_the_paths_of_cbirrt_stay_on_the_manifold_and_are_timed_by_the_velocity_
     use = np.abs(np.diff(found.q, axis=0)) / np.diff(found.t)[:, None] / robot.velocity_limit
     assert use.max() <= 1
     assert np.median(use.max(axis=1)) > 0.98
+
+
+def test_planners_know_the_tip_if_a_joint_has_its_name() -> None:
+    task = one_of("hits-81")
+    urdf = task.problem.urdf.replace('joint name="world_F_base_joint"', 'joint name="striker_tip"')
+    robot = open_problem(replace(task.problem, urdf=urdf))[1]
+    tip = Tip(robot).at(task.boundary.start_q[0])[0]
+    np.testing.assert_allclose(tip, task.problem.tip_positions(task.boundary.start_q)[0], atol=1e-12)
 
 
 def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:

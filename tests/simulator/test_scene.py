@@ -1,10 +1,16 @@
 """The simulated arm is the URDF's: its dynamics are Pinocchio's, and it keeps its energy where nothing brakes it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.spec import Payload
+from cnpgen.schema.keys import PerJoint
 from cnpgen.simulator import hockey
+from cnpgen.simulator.controller import Controller
 from cnpgen.simulator.plant import PLANTS, Plant
 from cnpgen.simulator.scene import Scene, scene_xml
 from tests.examples.plans import PROBLEMS, ROBOTS
@@ -16,15 +22,46 @@ def scene(name: str, plant: Plant = PLANTS["nominal"]) -> Scene:
     return Scene(PROBLEMS[name], ROBOTS[name], plant, np.full(len(PROBLEMS[name].obstacle), -1.0))
 
 
-def without_friction(name: str, step: float = 1e-4) -> "mujoco.MjModel":
-    model = mujoco.MjModel.from_xml_string(scene_xml(scene(name)))
+def without_friction(simulated: Scene, step: float = 1e-4) -> "mujoco.MjModel":
+    model = mujoco.MjModel.from_xml_string(scene_xml(simulated))
     model.dof_damping[:], model.dof_frictionloss[:], model.opt.timestep = 0, 0, step
     return model
 
 
+def with_tool() -> Scene:
+    """The heavy object held by a tool, with another body and other motors: all said in the problem, not in the URDF."""
+    shipped = PROBLEMS["heavy-object"]
+    problem = replace(
+        shipped,
+        robot=replace(shipped.robot, tip_offset=(0.1, -0.05, 0.2), tip_rotation=(0.3, -0.4, 0.5)),
+        payload=Payload(mass=2.5, centre=(0.01, 0.02, 0.03), size=(0.1, 0.2, 0.3)),
+        limits=replace(shipped.limits, torque=PerJoint((300.0, 300.0, 200.0, 200.0, 150.0, 60.0, 50.0))),
+    )
+    return Scene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
+
+
+def test_a_tool_and_a_payload_of_the_problem_are_simulated() -> None:
+    compare_with_pinocchio(with_tool())
+
+
+def test_motors_saturate_at_the_torques_of_the_problem() -> None:
+    tool = with_tool()
+    control = Controller(tool.problem, tool.robot, tool.plant)
+    still = np.zeros(tool.robot.n)
+    pulled = [control(tool.robot.base, still, (tool.robot.base + way, still, still)) for way in 10 * np.eye(7)]
+    assert tool.problem.limits.torque is not None
+    limit = np.array(tool.problem.limits.torque.values)
+    for torque in pulled:
+        assert np.max(np.abs(torque) / limit) == pytest.approx(1)
+
+
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_inverse_dynamics_and_tip_are_those_of_pinocchio(name: str) -> None:
-    robot, model = ROBOTS[name], without_friction(name)
+    compare_with_pinocchio(scene(name))
+
+
+def compare_with_pinocchio(simulated: Scene) -> None:
+    robot, model = simulated.robot, without_friction(simulated)
     data, other = mujoco.MjData(model), robot.model.createData()
     random = np.random.default_rng(0)
     for _ in range(20):
@@ -34,14 +71,14 @@ def test_inverse_dynamics_and_tip_are_those_of_pinocchio(name: str) -> None:
         mujoco.mj_inverse(model, data)
         np.testing.assert_allclose(data.qfrc_inverse[: robot.n], pin.rnea(robot.model, other, q, dq, ddq), atol=1e-9)
         pin.framesForwardKinematics(robot.model, other, q)
-        tip = other.oMf[robot.model.getFrameId(robot.tip)]
+        tip = other.oMf[robot.tip_frame]
         np.testing.assert_allclose(data.site("tip").xpos, tip.translation, atol=1e-12)
         np.testing.assert_allclose(data.site("tip").xmat.reshape(3, 3), tip.rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_falling_arm_keeps_its_energy(name: str) -> None:
-    robot, model = ROBOTS[name], without_friction(name)
+    robot, model = ROBOTS[name], without_friction(scene(name))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     data, other = mujoco.MjData(model), robot.model.createData()
     data.qpos[: robot.n] = robot.base + 0.3

@@ -15,7 +15,7 @@ from cnpgen.schema.catalogue import list_recipes
 from cnpgen.simulator.execute import execute
 from cnpgen.simulator.plant import PLANTS, as_plant
 from cnpgen.simulator.reference import TICK, Reference
-from cnpgen.simulator.simulate import execute_plan, simulate_plans
+from cnpgen.simulator.simulate import execute_plan, scene_of, simulate_plans
 from tests.examples.plans import ROBOTS, load
 
 pytest.importorskip("mujoco")
@@ -85,6 +85,15 @@ def test_a_motion_5_cm_too_high_misses_the_puck(hit: Plans) -> None:
             assert not found.executed.scored
             return
     raise AssertionError("neither way lifts the tip by 5 cm")
+
+
+def test_the_puck_lies_where_it_did_if_a_joint_has_the_name_of_the_tip(hit: Plans) -> None:
+    urdf = hit.problem.urdf.replace('joint name="world_F_base_joint"', 'joint name="striker_tip"')
+    assert urdf != hit.problem.urdf
+    same = replace(hit, problem=replace(hit.problem, urdf=urdf))
+    puck = scene_of(hit, PLANTS["nominal"]).puck
+    assert puck is not None
+    np.testing.assert_array_equal(scene_of(same, PLANTS["nominal"]).puck, puck)
 
 
 def test_a_puck_in_the_way_is_touched_early(hit: Plans) -> None:

@@ -17,7 +17,7 @@ class Tip:
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._data = robot.model, robot.model.createData()
-        self._frame = robot.model.getFrameId(robot.tip)
+        self._frame = robot.tip_frame
 
     def at(self, q: Array) -> tuple[Array, Array, Array]:
         """Return where it is at joint positions q [rad], shape (n,).
