@@ -20,6 +20,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.texts import utf8_text
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.blueprint import Blueprint
 
@@ -136,10 +137,8 @@ def load_notes(recipe: DatasetRecipe) -> str:
         return ""
     card = recipe.path.with_suffix(".md")
     try:
-        return card.read_bytes().decode("utf-8-sig") if card.is_file() else ""
+        return utf8_text(card.read_bytes(), advice="; it becomes part of the dataset's card") if card.is_file() else ""
     except OSError as error:
         raise RecipeError([f"{card}: cannot be read: {error.strerror or error}"]) from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        wrong = f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}"
-        raise RecipeError([f"{card}: {wrong}; it becomes part of the dataset's card"]) from error
+    except ValueError as error:
+        raise RecipeError([f"{card}: {error}"]) from error
