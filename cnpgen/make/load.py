@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import PluginError, RecipeError, UsageError
-from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.load import read_pipeline
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
 from cnpgen.pipelines.stages.stage import Stage
@@ -22,7 +22,7 @@ from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.texts import utf8_text
 from cnpgen.schema.toml import is_kind, read_table
-from cnpgen.store.blueprint import Blueprint
+from cnpgen.store.blueprint import REVISION, Blueprint
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
@@ -102,6 +102,11 @@ def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
     urdf, _ = blueprint.problem.urdf, blueprint.stages
     with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
         yield restore_dataset_recipe(dict(blueprint.recipe), urdf, Path(folder))
+
+
+def makes_its_rows(recipe: DatasetRecipe, blueprint: Blueprint) -> bool:
+    """Whether this version of cnpgen and its plug-ins makes the rows of a blueprint, of which the recipe is."""
+    return blueprint.revision == REVISION and recipe_digest(recipe) == blueprint.recipe_sha256
 
 
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
