@@ -65,6 +65,11 @@ def lacks(noun: str, name: str, known: Iterable[str]) -> str:
     return f"has no {noun} {name!r}{nearest(name, names)}, only {', '.join(names) or 'none'}"
 
 
+def either(choices: Sequence[str]) -> str:
+    """Join what there is a choice of: ``"problem, pipeline or dataset"``."""
+    return " or ".join(filter(None, (", ".join(choices[:-1]), choices[-1])))
+
+
 def counted(number: int, noun: str) -> str:
     """Write a number of things: ``"1 row"``, ``"120,000 rows"``."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

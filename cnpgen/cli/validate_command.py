@@ -89,4 +89,4 @@ def _rows(folder: Path) -> int:
         blueprint = load_blueprint(folder)
     except DatasetError:
         return 0
-    return sum(task.rows for task in shards(blueprint) if is_committed(folder, task, blueprint.of(task).fingerprint))
+    return sum(task.rows for task in shards(blueprint) if is_committed(folder, blueprint, task))

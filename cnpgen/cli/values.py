@@ -5,6 +5,8 @@ from argparse import ArgumentTypeError
 from decimal import Decimal
 from pathlib import Path
 
+from cnpgen.errors import either
+
 _PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
 MOST_ROWS = 10**12  # make.MAX_ROWS, and
@@ -82,8 +84,7 @@ def plot_file(text: str) -> str:
 def picture_file(text: str, *endings: str) -> str:
     """Read the name of a file with one of some endings, in a folder that is there."""
     if not text.lower().endswith(endings):
-        expected = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
-        raise ArgumentTypeError(f"expected a file that ends in {expected}, got {text!r}")
+        raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
     if not Path(text).absolute().parent.is_dir():
         raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
     return text

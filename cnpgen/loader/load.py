@@ -8,7 +8,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.shards import Shard, ShardReader
 from cnpgen.schema.arguments import flag
-from cnpgen.store.blueprint import Blueprint, ShardTask
+from cnpgen.store.blueprint import Blueprint, ShardTask, shards
 from cnpgen.store.files.documents import load_document
 from cnpgen.store.files.limits import ALWAYS, EXPANSION
 from cnpgen.store.intact import AGAIN
@@ -41,14 +41,14 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
     stored = open_dataset(folder, allow_incomplete=flag("allow_incomplete", allow_incomplete))
     if stored.manifest is None:
         summary = summarise(folder, stored.blueprint, allow_incomplete=True)
-        shards, statistics = _recorded(folder, summary), summary.statistics
+        listed, statistics = _recorded(folder, summary), summary.statistics
     else:
-        shards, statistics = (
+        listed, statistics = (
             _listed(folder, stored.blueprint, stored.manifest),
             _load_statistics(folder, stored.blueprint),
         )
-    _check_rows(stored.blueprint, shards)
-    present = _present(folder, shards, allow_incomplete=allow_incomplete)
+    _check_rows(stored.blueprint, listed)
+    present = _present(folder, listed, allow_incomplete=allow_incomplete)
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
     )
@@ -60,15 +60,7 @@ def _recorded(folder: Path, summary: Summary) -> dict[str, list[Shard]]:
     blueprint = summary.blueprint
     return {
         split: [
-            Shard(
-                folder / task.file,
-                record.rows,
-                record.first_sample_id,
-                record.bytes,
-                record.sha256,
-                blueprint.of(task).key,
-            )
-            for task, record in summary.of_split(split)
+            _shard(folder, blueprint, task, record.bytes, record.sha256) for task, record in summary.of_split(split)
         ]
         for split in blueprint.splits
     }
@@ -76,20 +68,18 @@ def _recorded(folder: Path, summary: Summary) -> dict[str, list[Shard]]:
 
 def _listed(folder: Path, blueprint: Blueprint, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
     """List the shards of a finished dataset by its manifest."""
+    tasks = {task.file: task for task in shards(blueprint)}
     return {
         split: [
-            Shard(
-                folder / entry["file"],
-                entry["rows"],
-                entry["first_sample_id"],
-                entry["bytes"],
-                entry["sha256"],
-                blueprint.of(ShardTask(split, index, entry["first_sample_id"], entry["rows"])).key,
-            )
-            for index, entry in enumerate(content["shards"])
+            _shard(folder, blueprint, tasks[entry["file"]], entry["bytes"], entry["sha256"])
+            for entry in content["shards"]
         ]
         for split, content in manifest["splits"].items()
     }
+
+
+def _shard(folder: Path, blueprint: Blueprint, task: ShardTask, size: int, sha256: str) -> Shard:
+    return Shard(folder / task.file, task.rows, task.first_row, size, sha256, blueprint.of(task).key)
 
 
 def _load_statistics(folder: Path, blueprint: Blueprint) -> Statistics:

@@ -8,11 +8,11 @@ from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.engine import Engine
 from cnpgen.make.blueprint import MAX_ROWS
 from cnpgen.make.dataset import Begin, MadeDataset, Progress, carry_out
-from cnpgen.make.load import restored
-from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
+from cnpgen.make.load import makes_its_rows, restored
+from cnpgen.make.recipe import DatasetRecipe, split_rows
 from cnpgen.make.shards import Job, prepare
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import REVISION, Blueprint, write_blueprint
+from cnpgen.store.blueprint import Blueprint, write_blueprint
 from cnpgen.store.card import card_notes
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.leftovers import sweep
@@ -86,7 +86,7 @@ def _extended(folder: Path, begun: Blueprint, recipe: DatasetRecipe, n: int) -> 
         return begun
     if any(splits.get(split, 0) < rows for split, rows in begun.splits.items()):
         raise UsageError(f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger n=, got {n:,}")
-    if begun.revision != REVISION or recipe_digest(recipe) != begun.recipe_sha256:
+    if not makes_its_rows(recipe, begun):
         raise UsageError(
             f"{folder} was made by another version of cnpgen or of its plug-ins, and this one would make other rows"
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import PluginError, RecipeError, UsageError
-from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.load import read_pipeline
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
 from cnpgen.pipelines.stages.stage import Stage
@@ -20,8 +20,9 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.texts import utf8_text
 from cnpgen.schema.toml import is_kind, read_table
-from cnpgen.store.blueprint import Blueprint
+from cnpgen.store.blueprint import REVISION, Blueprint
 
 
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
@@ -103,6 +104,11 @@ def restored(blueprint: Blueprint) -> Iterator[DatasetRecipe]:
         yield restore_dataset_recipe(dict(blueprint.recipe), urdf, Path(folder))
 
 
+def makes_its_rows(recipe: DatasetRecipe, blueprint: Blueprint) -> bool:
+    """Whether this version of cnpgen and its plug-ins makes the rows of a blueprint, of which the recipe is."""
+    return blueprint.revision == REVISION and recipe_digest(recipe) == blueprint.recipe_sha256
+
+
 def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
     table = read_table(path, ("dataset", "pipeline"), mistakes)
     if table is None:
@@ -136,10 +142,8 @@ def load_notes(recipe: DatasetRecipe) -> str:
         return ""
     card = recipe.path.with_suffix(".md")
     try:
-        return card.read_bytes().decode("utf-8-sig") if card.is_file() else ""
+        return utf8_text(card.read_bytes(), advice="; it becomes part of the dataset's card") if card.is_file() else ""
     except OSError as error:
         raise RecipeError([f"{card}: cannot be read: {error.strerror or error}"]) from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        wrong = f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}"
-        raise RecipeError([f"{card}: {wrong}; it becomes part of the dataset's card"]) from error
+    except ValueError as error:
+        raise RecipeError([f"{card}: {error}"]) from error

@@ -95,7 +95,7 @@ def _owners(folders: Sequence[Path], out: Path, blueprint: Blueprint) -> dict[Sh
         having = [folder for folder in folders if (folder / task.sidecar).exists()]
         if len(having) > 1:
             raise UsageError(f"{having[0]} and {having[1]} both have {task.file}: parts must not overlap")
-        if is_committed(out, task, blueprint.of(task).fingerprint):
+        if is_committed(out, blueprint, task):
             if having and read_file(having[0] / task.sidecar) != read_file(out / task.sidecar):
                 raise UsageError(f"{having[0]} and {out} both have {task.file}: parts must not overlap")
         elif having:
@@ -110,7 +110,7 @@ def _owners(folders: Sequence[Path], out: Path, blueprint: Blueprint) -> dict[Sh
 
 def _copy(folder: Path, out: Path, task: ShardTask, blueprint: Blueprint) -> None:
     """Copy a shard and then its sidecar, by which it counts as made."""
-    record = load_committed(folder, task, blueprint.of(task).fingerprint)
+    record = load_committed(folder, blueprint, task)
     with committing(out / task.file, out / WORK) as temporary:
         shutil.copyfile(folder / task.file, temporary)
         if file_sha256(temporary) != record.sha256:

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.load import restored
-from cnpgen.make.recipe import recipe_digest
+from cnpgen.make.load import makes_its_rows, restored
 from cnpgen.pipelines.piece import Block
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.blueprint import REVISION, Blueprint, ShardTask
+from cnpgen.store.blueprint import Blueprint, ShardTask
 from cnpgen.store.fates import Fates, merge_fates
 from cnpgen.store.field import Field
 from cnpgen.store.record import commit_shard
@@ -60,7 +59,7 @@ def prepare(job: Job) -> PreparedPipeline:
     if job.pipeline is not None:
         return load(job.pipeline)
     with restored(job.blueprint) as recipe:
-        if job.blueprint.revision != REVISION or recipe_digest(recipe) != job.blueprint.recipe_sha256:
+        if not makes_its_rows(recipe, job.blueprint):
             raise MachineError(
                 f"{platform.node()} has another version of cnpgen, or of a plug-in, which would make other rows:"
                 " install the same ones on all machines"

@@ -6,6 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError
+from cnpgen.schema.texts import read_at_most, utf8_text
 
 MOST_BYTES = 1 << 23
 MOST_PARTS = 1_000  # links, and joints: Pinocchio descends a chain by recursion, and of 5,000 does not come back
@@ -44,17 +45,11 @@ def read_urdf(path: Path) -> str:
         RecipeError: It cannot be read, is too large or is not UTF-8.
     """
     try:
-        if not path.is_file():
-            raise RecipeError([f"{path}: {'not a file' if path.exists() else 'no such file'}"])
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise RecipeError([f"{path}: has {size:,} bytes, expected a URDF of at most {MOST_BYTES:,}"])
-        return path.read_bytes().decode()
+        return utf8_text(read_at_most(path, MOST_BYTES, "a URDF"), "utf-8", advice="; save the URDF as UTF-8")
     except OSError as error:
         raise RecipeError([f"{path}: cannot be read: {error.strerror or error}"]) from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        wrong = f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}"
-        raise RecipeError([f"{path}: {wrong}; save the URDF as UTF-8"]) from error
+    except ValueError as error:
+        raise RecipeError([f"{path}: {error}"]) from error
 
 
 def urdf_tree(text: str) -> ElementTree.Element:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import RecipeError, either, nearest
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
@@ -54,13 +54,8 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
         raise ValueError(f"no such file: {(folder or Path()) / shown}{hint}")
     if text not in known:
         hint = _hint(shown, kinds, known)
-        raise ValueError(f"unknown {_either(kinds)} {shown!r}{hint}; known: {', '.join(known) or 'none'}")
+        raise ValueError(f"unknown {either(kinds)} {shown!r}{hint}; known: {', '.join(known) or 'none'}")
     return known[text]
-
-
-def _either(kinds: tuple[Kind, ...]) -> str:
-    """Join kinds: ``"problem, pipeline or dataset"``."""
-    return " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
 
 
 def _hint(text: str, kinds: tuple[Kind, ...], known: Iterable[str]) -> str:

@@ -5,6 +5,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
+from cnpgen.schema.texts import read_at_most, utf8_text
+
 Kind = Literal["problem", "pipeline", "dataset", "suite"]
 
 MARKS: dict[Kind, set[str]] = {
@@ -27,7 +29,7 @@ _LONG_KEY = re.compile(
 def kind_of_file(path: Path) -> Kind:
     """Tell the kind of a recipe file by its keys; "dataset" where they do not tell or it cannot be read."""
     try:
-        table = _toml(_read(path))
+        table = _read(path)
     except (OSError, ValueError):
         return "dataset"
     return next((kind for kind in MARKS if is_kind(kind, table)), "dataset")
@@ -36,21 +38,12 @@ def kind_of_file(path: Path) -> Kind:
 def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict[str, Any] | None:
     """Return the top-level table of a recipe file, or None after a mistake."""
     try:
-        return _expect(kinds, _toml(_read(path)))
+        return _expect(kinds, _read(path))
     except OSError as error:
         mistakes.append(f"{path}: cannot be read: {error.strerror}")
     except ValueError as error:
         mistakes.append(f"{path}: {error}")
     return None
-
-
-def _read(path: Path) -> bytes:
-    """Read a recipe file; a ValueError says that it is none."""
-    if not path.is_file():
-        raise ValueError("not a file" if path.exists() else "no such file")
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"has {size:,} bytes, expected a recipe of at most {MOST_BYTES:,}")
-    return path.read_bytes()
 
 
 def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
@@ -61,13 +54,10 @@ def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def _toml(data: bytes) -> dict[str, Any]:
-    """Parse TOML; a ValueError says in which line it is wrong."""
-    try:
-        content = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise ValueError(f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}") from error
+def _read(path: Path) -> dict[str, Any]:
+    """Read a file and parse it as TOML; a ValueError says that it is none, or in which line it is wrong."""
+    data = read_at_most(path, MOST_BYTES, "a recipe")
+    content = utf8_text(data)
     if key := _LONG_KEY.search(content):
         line = content.count("\n", 0, key.start()) + 1
         raise ValueError(f"line {line}: a key has more than {MOST_PARTS} parts")

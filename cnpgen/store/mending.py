@@ -61,7 +61,7 @@ def find_damaged(
 def _problem(folder: Path, blueprint: Blueprint, task: ShardTask) -> str:
     """Say what is wrong with a shard, or nothing."""
     try:
-        check_committed(folder, task, blueprint.of(task).fingerprint)
+        check_committed(folder, blueprint, task)
     except DatasetError as error:
         return str(error)
     return ""

@@ -46,7 +46,7 @@ class StoredDataset:
             raise DatasetError(f"{self.folder} {lacks('split', split, self.blueprint.splits)}")
         found = [task for task in shards(self.blueprint) if task.split == split]
         if self.manifest is None:
-            return [task for task in found if is_committed(self.folder, task, self.blueprint.of(task).fingerprint)]
+            return [task for task in found if is_committed(self.folder, self.blueprint, task)]
         return found
 
     def iter_shards(

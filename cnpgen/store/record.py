@@ -142,15 +142,14 @@ def commit_shard(
         DatasetError: The columns are not what the blueprint says, or not finite.
         MachineError: The disk is full, read-only or otherwise unwilling.
     """
-    fingerprint = blueprint.of(task).fingerprint
-    if is_committed(folder, task, fingerprint):  # by somebody to whom the same work was given
+    if is_committed(folder, blueprint, task):  # by somebody to whom the same work was given
         return load_record(folder, task)
     about = {"fates": fates, "started": started, "seconds": seconds, "versions": versions or {}}
     try:
         return _write(folder, blueprint, task, columns, about)
     except CnpgenError:
         # somebody may have committed it meanwhile, finished the dataset and swept our temporary file away with theirs
-        if is_committed(folder, task, fingerprint):
+        if is_committed(folder, blueprint, task):
             return load_record(folder, task)
         raise
 
@@ -163,7 +162,7 @@ def _write(
     about: Mapping[str, Any],
 ) -> ShardRecord:
     """Write a shard and then its sidecar, which says how the shard came about, unless somebody else has meanwhile."""
-    path, fingerprint = folder / task.file, blueprint.of(task).fingerprint
+    path = folder / task.file
     size = write_shard(
         path, columns, blueprint.fields, shard_attributes(blueprint, task), dtype=blueprint.dtype, work=folder / WORK
     )
@@ -173,23 +172,23 @@ def _write(
         sha256=file_sha256(path),
         rows=task.rows,
         first_sample_id=task.first_row,
-        plan_fingerprint=fingerprint,
+        plan_fingerprint=blueprint.of(task).fingerprint,
         statistics=column_statistics(columns, blueprint.fields),
         **about,
     )
-    if is_committed(folder, task, fingerprint):  # meanwhile, by somebody who may have summed up their record
+    if is_committed(folder, blueprint, task):  # meanwhile, by somebody who may have summed up their record
         return load_record(folder, task)
     save_record(folder, task, record)
     return record
 
 
-def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardRecord:
+def load_committed(folder: Path, blueprint: Blueprint, task: ShardTask) -> ShardRecord:
     """Read a shard's sidecar and make sure that it stands for a shard of this blueprint; the shard itself is not read.
 
     Args:
         folder: The dataset's folder.
+        blueprint: Its blueprint.
         task: Which shard.
-        fingerprint: The fingerprint of the blueprint.
 
     Raises:
         DatasetError: The sidecar is missing, damaged or of another blueprint, or the shard is missing or of another
@@ -197,7 +196,7 @@ def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardReco
         MachineError: The system would not let us read it.
     """
     record = load_record(folder, task)
-    if record.plan_fingerprint != fingerprint:
+    if record.plan_fingerprint != blueprint.of(task).fingerprint:
         raise DatasetError(f"{folder / task.sidecar} belongs to another blueprint ({record.plan_fingerprint[:12]}...)")
     path = folder / task.file
     size = path.stat().st_size if path.is_file() else None
@@ -207,27 +206,27 @@ def load_committed(folder: Path, task: ShardTask, fingerprint: str) -> ShardReco
     return record
 
 
-def check_committed(folder: Path, task: ShardTask, fingerprint: str) -> None:
+def check_committed(folder: Path, blueprint: Blueprint, task: ShardTask) -> None:
     """Read a shard's sidecar and the shard itself and make sure that they are what was written.
 
     Args:
         folder: The dataset's folder.
+        blueprint: Its blueprint.
         task: Which shard.
-        fingerprint: The fingerprint of the blueprint.
 
     Raises:
         DatasetError: Like :func:`load_committed`, or the shard was changed.
         MachineError: The system would not let us read it.
     """
-    record = load_committed(folder, task, fingerprint)
+    record = load_committed(folder, blueprint, task)
     if file_sha256(folder / task.file) != record.sha256:
         raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
 
 
-def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
+def is_committed(folder: Path, blueprint: Blueprint, task: ShardTask) -> bool:
     """Whether a shard is made: its sidecar is whole and of this blueprint, and its file has the recorded size."""
     try:
-        load_committed(folder, task, fingerprint)
+        load_committed(folder, blueprint, task)
     except DatasetError:
         return False
     return True
@@ -235,4 +234,4 @@ def is_committed(folder: Path, task: ShardTask, fingerprint: str) -> bool:
 
 def pending(folder: Path, blueprint: Blueprint) -> list[ShardTask]:
     """List the shards that are still to be made, in order."""
-    return [task for task in shards(blueprint) if not is_committed(folder, task, blueprint.of(task).fingerprint)]
+    return [task for task in shards(blueprint) if not is_committed(folder, blueprint, task)]

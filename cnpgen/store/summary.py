@@ -93,7 +93,7 @@ def summarise(folder: Path, blueprint: Blueprint, *, allow_incomplete: bool = Fa
 
 def _fitting(folder: Path, blueprint: Blueprint, task: ShardTask) -> ShardRecord:
     """Read a sidecar, which must be of the blueprint's fields."""
-    record = load_committed(folder, task, blueprint.of(task).fingerprint)
+    record = load_committed(folder, blueprint, task)
     if not are_of(record.statistics, blueprint.fields):
         raise DatasetError(f"{folder / task.sidecar} has statistics of other fields than {PLAN}")
     return record

@@ -138,7 +138,7 @@ def validate_dataset(
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
     _require_means(folder, blueprint, deep=deep, regenerate=regenerate)
-    present = [task for task in shards(blueprint) if is_committed(folder, task, blueprint.of(task).fingerprint)]
+    present = [task for task in shards(blueprint) if is_committed(folder, blueprint, task)]
     wrong = {finding.file for finding in findings if not finding.note}
     whole = [task for task in present if task.file not in wrong]
     findings += check_recipe(blueprint) + (check_statistics(folder, blueprint) if deep else [])

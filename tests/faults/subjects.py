@@ -29,16 +29,22 @@ from cnpgen.problems.record import open_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.journal import open_journal
 from cnpgen.store.blueprint import from_json
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import canonical_sha256, save_document
 from cnpgen.store.files.sealed import BLOCK, Content, read_sealed, seal, under_seal
 from cnpgen.store.inspection import inspect_dataset
+from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.shard import read_schema, read_shard
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.validate.dataset import validate_dataset
+from tests.examples.documents import unsealed
 from tests.faults.good_files import IDENTITY
 from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf
 
 DOCUMENTS = ("plan.json", "manifest.json", "stats.json", "train/shard-00000.json", "validation/shard-00000.json")
+
+
+Change = Callable[[Path, Path, Random], None]
 
 
 @dataclass(frozen=True)
@@ -50,33 +56,36 @@ class Subject:
         read: Reads it in every way that cnpgen has.
     """
 
-    change: Callable[[Path, Path, Random], None]
+    change: Change
     read: Callable[[Path, Random], None]
 
 
-def _change_recipe(good: Path, folder: Path, draw: Random) -> None:
-    shutil.copytree(good / "recipes", folder / "recipes")
-    path = folder / "recipes" / draw.choice(("datasets.toml", "pipelines.toml", "problem.toml"))
-    content = path.read_bytes()
-    if draw.random() < 0.2:
-        path.write_bytes(change_bytes(content, draw))
-    else:
-        path.write_text(change_text(content.decode(), draw), encoding="utf-8", errors="replace")
+def _change_text_of(find: Callable[[Path, Random], Path], change_content: Callable[[str, Random], str]) -> Change:
+    """Change one of the texts in the folder of recipes, mostly as a text."""
+
+    def change(good: Path, folder: Path, draw: Random) -> None:
+        shutil.copytree(good / "recipes", folder / "recipes")
+        path = find(folder / "recipes", draw)
+        content = path.read_bytes()
+        if draw.random() < 0.2:
+            path.write_bytes(change_bytes(content, draw))
+        else:
+            path.write_text(change_content(content.decode(), draw), encoding="utf-8", errors="replace")
+
+    return change
+
+
+def _recipe_in(folder: Path, draw: Random) -> Path:
+    return folder / draw.choice(("datasets.toml", "pipelines.toml", "problem.toml"))
+
+
+def _urdf_in(folder: Path, _draw: Random) -> Path:
+    return next(folder.glob("*.urdf"))
 
 
 def _read_recipe(folder: Path, draw: Random) -> None:
     recipe = load_dataset_recipe(folder / "recipes" / "datasets.toml")
     load_robot(recipe.pipeline.problem)
-
-
-def _change_urdf(good: Path, folder: Path, draw: Random) -> None:
-    shutil.copytree(good / "recipes", folder / "recipes")
-    path = next((folder / "recipes").glob("*.urdf"))
-    content = path.read_bytes()
-    if draw.random() < 0.2:
-        path.write_bytes(change_bytes(content, draw))
-    else:
-        path.write_text(change_urdf(content.decode(), draw), encoding="utf-8", errors="replace")
 
 
 def _read_urdf(folder: Path, draw: Random) -> None:
@@ -91,9 +100,7 @@ def _change_document(good: Path, folder: Path, draw: Random) -> None:
     if draw.random() < 0.1:
         path.write_bytes(change_bytes(path.read_bytes(), draw))
         return
-    document = json.loads(path.read_text(encoding="utf-8"))
-    del document["self_sha256"]
-    changed = change_json(document, draw)
+    changed = change_json(unsealed(path), draw)
     if name == "plan.json" and draw.random() < 0.7:
         _follow(folder / "set", changed)
     _save(path, changed)
@@ -106,30 +113,20 @@ def _follow(folder: Path, plan: dict[str, Any]) -> None:
     with suppress(CnpgenError, ValueError, KeyError, TypeError):
         plan["fingerprint"] = from_json(plan).fingerprint
     for name in DOCUMENTS[1:]:
-        document = json.loads((folder / name).read_text(encoding="utf-8"))
-        del document["self_sha256"]
-        _save(folder / name, {**document, "plan_fingerprint": plan.get("fingerprint")})
+        _save(folder / name, {**unsealed(folder / name), "plan_fingerprint": plan.get("fingerprint")})
 
 
 def _list_again(folder: Path) -> None:
     """Bring the digests in the manifest up to date."""
-    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    del manifest["self_sha256"]
+    manifest = unsealed(folder / "manifest.json")
     for name, entry in manifest["files"].items():
-        entry |= {"sha256": _sha256(folder / name), "bytes": (folder / name).stat().st_size}
+        entry |= {"sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size}
     for split in manifest["splits"].values():
         for entry in split["shards"]:
-            entry["sidecar"]["sha256"] = _sha256(folder / entry["sidecar"]["file"])
-            entry |= {"sha256": _sha256(folder / entry["file"]), "bytes": (folder / entry["file"]).stat().st_size}
-    files = sorted(
-        (entry["file"], entry["sha256"]) for split in manifest["splits"].values() for entry in split["shards"]
-    )
-    lines = "".join(f"{sha256}  {file}\n" for file, sha256 in files)
-    _save(folder / "manifest.json", {**manifest, "fingerprint": hashlib.sha256(lines.encode()).hexdigest()})
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+            entry["sidecar"]["sha256"] = file_sha256(folder / entry["sidecar"]["file"])
+            entry |= {"sha256": file_sha256(folder / entry["file"]), "bytes": (folder / entry["file"]).stat().st_size}
+    files = ((entry["file"], entry["sha256"]) for split in manifest["splits"].values() for entry in split["shards"])
+    _save(folder / "manifest.json", {**manifest, "fingerprint": data_fingerprint(files)})
 
 
 def _save(path: Path, document: Mapping[str, Any]) -> None:
@@ -162,9 +159,7 @@ def _change_shard(good: Path, folder: Path, draw: Random) -> None:
     path = folder / "set" / "train" / "shard-00000.h5"
     path.write_bytes(_changed_hdf5(path.read_bytes(), draw))
     sidecar = path.with_suffix(".json")
-    record = json.loads(sidecar.read_text(encoding="utf-8"))
-    del record["self_sha256"]
-    _save(sidecar, {**record, "sha256": _sha256(path), "bytes": path.stat().st_size})
+    _save(sidecar, {**unsealed(sidecar), "sha256": file_sha256(path), "bytes": path.stat().st_size})
     _list_again(folder / "set")
 
 
@@ -248,7 +243,7 @@ def _read_plans(folder: Path, draw: Random) -> None:
         evaluate_plans(plans[:2], workers=1).summary()
 
 
-def _change_sealed(name: str, kind: str) -> Callable[[Path, Path, Random], None]:
+def _change_sealed(name: str, kind: str) -> Change:
     def change(good: Path, folder: Path, draw: Random) -> None:
         content = (good / name).read_bytes()
         path = folder / name
@@ -309,8 +304,8 @@ def _read_journal(folder: Path, draw: Random) -> None:
 
 
 SUBJECTS: dict[str, Subject] = {
-    "recipe": Subject(_change_recipe, _read_recipe),
-    "urdf": Subject(_change_urdf, _read_urdf),
+    "recipe": Subject(_change_text_of(_recipe_in, change_text), _read_recipe),
+    "urdf": Subject(_change_text_of(_urdf_in, change_urdf), _read_urdf),
     "document": Subject(_change_document, _read_set),
     "shard": Subject(_change_shard, _read_shard),
     "plans": Subject(_change_plans, _read_plans),

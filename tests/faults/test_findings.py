@@ -1,8 +1,6 @@
 """Inputs that once ended in neither a result nor a CnpgenError, each as small as it could be made."""
 
-import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +14,12 @@ from cnpgen.plans.plans import screen
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.store.blueprint import load_blueprint, shards
-from cnpgen.store.files.documents import save_document
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.record import load_record
+from tests.examples.documents import rewritten
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
 from tests.examples.store import dataset  # noqa: F401 - a fixture
-
-
-def rewritten(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    document = json.loads(path.read_text(encoding="utf-8"))
-    del document["self_sha256"]
-    change(document)
-    save_document(path, document)
 
 
 @pytest.mark.parametrize("value", [[], {}, [1], {"a": 1}], ids=str)

@@ -12,6 +12,7 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make import extend as extend_module
+from cnpgen.make import load as load_module
 from cnpgen.make.extend import extend_dataset
 from cnpgen.store.blueprint import load_blueprint, shards
 from cnpgen.store.inspection import inspect_dataset
@@ -162,7 +163,7 @@ def test_what_cannot_be_extended_is_refused_and_left_as_it_is(damaged, tmp_path,
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="holds no dataset"):
         extend_dataset(tmp_path / "empty", 1000)
-    monkeypatch.setattr(extend_module, "REVISION", 3)
+    monkeypatch.setattr(load_module, "REVISION", 3)
     with pytest.raises(UsageError, match="was made by another version of cnpgen or of its plug-ins"):
         extend_dataset(damaged, ROWS)
     assert snapshot(damaged) == before

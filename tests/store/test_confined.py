@@ -1,6 +1,5 @@
 """A dataset whose documents were written by a forger under right seals: what they name is in the folder, or refused."""
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,20 +12,13 @@ from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.loader.load import load_dataset
 from cnpgen.store.blueprint import load_blueprint, shards
 from cnpgen.store.check import check_dataset
-from cnpgen.store.files.documents import canonical_sha256, save_document
+from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.reader import open_dataset
+from tests.examples.documents import rewritten
 from tests.examples.store import BLUEPRINT, dataset  # noqa: F401 - a fixture
 
 Change = Callable[[dict[str, Any]], None]
-
-
-def rewritten(path: Path, change: Change) -> None:
-    """Change a document and seal it again."""
-    document = json.loads(path.read_text(encoding="utf-8"))
-    del document["self_sha256"]
-    change(document)
-    save_document(path, document)
 
 
 def first_shard(manifest: dict[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ TASK = shards(BLUEPRINT)[0]
 
 def test_a_committed_shard_has_a_record_that_describes_it(tmp_path: Path) -> None:
     record = make_shard(tmp_path, BLUEPRINT, TASK)
-    assert is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+    assert is_committed(tmp_path, BLUEPRINT, TASK)
     assert record_to_json(load_record(tmp_path, TASK)) == record_to_json(record)
     assert record.sha256 == file_sha256(tmp_path / "train/shard-00000.h5")
     assert record.bytes == (tmp_path / "train/shard-00000.h5").stat().st_size
@@ -68,7 +68,7 @@ def test_the_shard_is_there_before_its_sidecar(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(MachineError, match=r"shard-00000\.json"):
         make_shard(tmp_path, BLUEPRINT, TASK)
     assert [path.name for path in (tmp_path / "train").iterdir()] == ["shard-00000.h5"]
-    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+    assert not is_committed(tmp_path, BLUEPRINT, TASK)
 
 
 def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> None:
@@ -111,9 +111,9 @@ def test_a_damaged_shard_or_sidecar_is_not_committed(
 ) -> None:
     make_shard(tmp_path, BLUEPRINT, TASK)
     (tmp_path / name).write_bytes(action((tmp_path / name).read_bytes()))
-    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+    assert not is_committed(tmp_path, BLUEPRINT, TASK)
     with pytest.raises(DatasetError, match=name.split("/")[1]):
-        load_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+        load_committed(tmp_path, BLUEPRINT, TASK)
 
 
 def test_a_flipped_digit_in_a_sidecar_is_noticed(tmp_path: Path) -> None:
@@ -125,12 +125,12 @@ def test_a_flipped_digit_in_a_sidecar_is_noticed(tmp_path: Path) -> None:
 
 
 def test_missing_shards_and_those_of_another_blueprint_are_not_committed(tmp_path: Path) -> None:
-    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+    assert not is_committed(tmp_path, BLUEPRINT, TASK)
     make_shard(tmp_path, BLUEPRINT, TASK)
     with pytest.raises(DatasetError, match="another blueprint"):
-        load_committed(tmp_path, TASK, replace(BLUEPRINT, seed=1).fingerprint)
+        load_committed(tmp_path, replace(BLUEPRINT, seed=1), TASK)
     (tmp_path / TASK.file).unlink()
-    assert not is_committed(tmp_path, TASK, BLUEPRINT.fingerprint)
+    assert not is_committed(tmp_path, BLUEPRINT, TASK)
 
 
 def test_a_sidecar_of_another_shard_is_refused(tmp_path: Path) -> None:
