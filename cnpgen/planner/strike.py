@@ -16,6 +16,7 @@ from cnpgen.pipelines.stages.stage import TaskRound
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.requests import CERTIFIED
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.plans.plans import Plans
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -82,8 +83,7 @@ def strike_tasks(
 
 def boundary_of_tasks(tasks: TaskRound) -> Boundary:
     """Return the boundary conditions of the tasks that have an answer."""
-    names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
+    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in BOUNDARY))
 
 
 def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
