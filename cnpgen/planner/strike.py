@@ -78,7 +78,7 @@ def strike_tasks(
     for name, values in zip(GIVEN, columns, strict=True):
         if values.shape[1] not in {1, count}:
             raise UsageError(f"{name} is given for {values.shape[1]:,} strikes, something else for {count:,}")
-    return completion({name: _repeated(values, count) for name, values in zip(GIVEN, columns, strict=True)})
+    return completion(dict(zip(GIVEN, columns, strict=True)))
 
 
 def boundary_of_tasks(tasks: TaskRound) -> Boundary:
@@ -95,8 +95,3 @@ def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
     if not math.isfinite(array.sum()) and not np.isfinite(array).all():
         raise UsageError(f"{name} must be finite, got {array}")
     return array.reshape(-1, array.shape[-1]).T
-
-
-def _repeated(values: Array, count: int) -> Array:
-    same = values if values.shape[1] == count else np.broadcast_to(values, (len(values), count))
-    return np.ascontiguousarray(same)
