@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.judges.rows.verify import verify_rows
-from cnpgen.kernels.library import KernelLibrary
-from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.context import Context, load_context
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.collision import Collision, capsule_clearance
@@ -15,7 +14,6 @@ from cnpgen.pipelines.stages.stage import Round
 from cnpgen.pipelines.undecided import settle, undecided
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
 from cnpgen.world.state import World
 from tests.conftest import Prepare, run_stages
 from tests.examples.shaped_robot import write_problem
@@ -51,9 +49,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 
 @pytest.fixture(scope="module")
 def context(problem: Problem, cache_folder: Path) -> Context:
-    robot = load_robot(problem)
-    library = KernelLibrary("numpy", cache_folder, problem.identity, {"robot": robot, "problem": problem})
-    return Context(problem, robot, library)
+    return load_context(problem, "numpy", cache_folder)
 
 
 @pytest.fixture(scope="module")
