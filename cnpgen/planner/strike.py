@@ -15,7 +15,7 @@ from cnpgen.pipelines.stages.hitting_velocity import SHARE
 from cnpgen.pipelines.stages.stage import TaskRound
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.model import Model
-from cnpgen.planner.requests import CERTIFIED
+from cnpgen.planner.requests import drawing_stages
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.plans.plans import Plans
 from cnpgen.schema.arguments import numbers
@@ -56,11 +56,10 @@ def load_completion(model: Model, backend: str | None) -> Completion:
     stages = model.training.get("stages")
     if stages is None:
         raise UsageError("the model does not say how the rows were drawn that it was trained on: it cannot strike")
-    drawing = [stage for stage in stages if stage.get("use") != CERTIFIED]
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with surroundings(model.problem, backend) as given:
         context = Context(given.problem, given.robot, given.kernels)
-        return Completion(restore_pipeline(name, drawing, given.problem), context, GIVEN)
+        return Completion(restore_pipeline(name, drawing_stages(stages), given.problem), context, GIVEN)
 
 
 def strike_tasks(
