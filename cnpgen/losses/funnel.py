@@ -59,7 +59,7 @@ def make_funnel(problem: Problem, robot: "Robot", form: str) -> Funnel:
 
     q, dq, ddq = (ca.vertsplit(ca.SX.sym(name, robot.n)) for name in ("q", "dq", "ddq"))
     tops = ca.vertsplit(ca.SX.sym("tops", len(problem.obstacle)))
-    size = problem.object.size if problem.object is not None else None
+    size = problem.object_size
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
     chosen = (pair for pair in stated(problem, state, form) if has_funnel(pair[0]))
     return Funnel(tuple((constraint, condition) for constraint, conditions in chosen for condition in conditions))

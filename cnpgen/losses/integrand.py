@@ -116,7 +116,7 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldSta
     sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
     p, dp, ddp, rate = sym("p", n), sym("dp", n), sym("ddp", n), sym("rate", 2)
     dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
-    tops, size = sym("tops", len(problem.obstacle)), problem.object.size if problem.object is not None else None
+    tops, size = sym("tops", len(problem.obstacle)), problem.object_size
     q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
     state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size)
     pairs = stated(problem, state, form)

@@ -76,9 +76,7 @@ def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayL
     for name, values in given.items():
         if len(values) not in {1, count}:
             raise UsageError(f"{name} is given for {counted(len(values), 'task')}, another column for {count:,}")
-    tasks = completion(
-        {name: np.ascontiguousarray(np.broadcast_to(rows, (count, rows.shape[1])).T) for name, rows in given.items()}
-    )
+    tasks = completion({name: rows.T for name, rows in given.items()})
     rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
     problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
     return Completed(plans_of_rows(problem, rows, source=source), tasks.why())

@@ -100,7 +100,7 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
 
     names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", len(problem.obstacle)), ("p", 3))
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops), (p_sx, p) = (symbols(name, width) for name, width in names)
-    size = problem.object.size if problem.object is not None else None
+    size = problem.object_size
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
     rows: list[Scalar] = []
     for constraint in problem.constraint:

@@ -58,15 +58,17 @@ class Completion:
         """Complete N tasks, each for itself.
 
         Args:
-            columns: What is given, name -> values, shape (width, N), float64 and contiguous; of positions on a table
-                the height may be missing.
+            columns: What is given, name -> values, shape (width, N), or (width, 1) for all tasks, float64; of positions
+                on a table the height may be missing.
 
         Returns:
             The tasks; those that have no answer are no longer among the survivors, and have a fate.
         """
-        draws = TaskRound(next(iter(columns.values())).shape[1])
+        draws = TaskRound(max(values.shape[1] for values in columns.values()))
         for name, values in columns.items():
-            draws[name] = values if len(values) != 2 or not name.endswith("_xyz") else self._on_table(values)
+            whole = values if len(values) != 2 or not name.endswith("_xyz") else self._on_table(values)
+            same = whole if whole.shape[1] == draws.size else np.broadcast_to(whole, (len(whole), draws.size))
+            draws[name] = np.ascontiguousarray(same)
         self._derive(draws)
         for label, work in self._stages:
             draws.stage = label

@@ -107,7 +107,7 @@ def _any_conditions(robot: "Robot", problem: Problem) -> list[tuple[Condition, i
 
 def _conditions(robot: "Robot", problem: Problem, state: _State, tops: Vec) -> list[tuple[Condition, int]]:
     """State all constraints at a state, each with the highest derivative of q that it depends on."""
-    size = problem.object.size if problem.object is not None else None
+    size = problem.object_size
     symbolic = SymbolicState(robot, state.q, state.dq, state.ddq, tops, problem.obstacle, size)
     found = [condition for constraint in problem.constraint for condition in constraint.symbolic(symbolic)]
     return [(condition, symbolic_needs(condition, state.of_dq, state.of_ddq)) for condition in found]

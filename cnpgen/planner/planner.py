@@ -17,6 +17,7 @@ from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.planner.strike import MEETING, State, Strikes, boundary_of_tasks, load_completion, strike_tasks
+from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.schema.arguments import numbers
@@ -157,7 +158,7 @@ class Planner:
         if self._completion is None:
             self._completion = load_completion(self.model, self._options["backend"])
         tasks = strike_tasks(self._completion, state, puck, towards, meeting=meeting, share=speed_share)
-        columns = {name: tasks[name][0] for name in ("hit_angle", "hit_speed")}
+        columns = {name: tasks[name][0] for name in CONTEXT}
         boundary = self._rested(boundary_of_tasks(tasks))
         return Strikes(self._kit.plan(self.model, boundary, sample_id=tasks.alive, columns=columns), tasks.why())
 

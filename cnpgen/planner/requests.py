@@ -86,9 +86,14 @@ def check_problem(where: str, found: ProblemRecord, model: Model) -> None:
         )
 
 
+def drawing_stages(stages: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the stages that draw rows: those of a certified dataset are the same, only that its rows have plans."""
+    return [stage for stage in stages if stage.get("use") != CERTIFIED]
+
+
 def _drawing(stages: Iterable[Mapping[str, Any]]) -> str:
-    """Digest of how rows are drawn; that of a certified dataset is the same, only that its rows have plans."""
-    return canonical_sha256([stage for stage in stages if stage.get("use") != CERTIFIED])
+    """Digest of how rows are drawn."""
+    return canonical_sha256(drawing_stages(stages))
 
 
 def check_drawing(where: str, blueprint: Blueprint, model: Model, *, other: bool) -> None:

@@ -15,7 +15,8 @@ from cnpgen.pipelines.stages.hitting_velocity import SHARE
 from cnpgen.pipelines.stages.stage import TaskRound
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.model import Model
-from cnpgen.planner.requests import CERTIFIED
+from cnpgen.planner.requests import drawing_stages
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.plans.plans import Plans
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -55,11 +56,10 @@ def load_completion(model: Model, backend: str | None) -> Completion:
     stages = model.training.get("stages")
     if stages is None:
         raise UsageError("the model does not say how the rows were drawn that it was trained on: it cannot strike")
-    drawing = [stage for stage in stages if stage.get("use") != CERTIFIED]
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with surroundings(model.problem, backend) as given:
         context = Context(given.problem, given.robot, given.kernels)
-        return Completion(restore_pipeline(name, drawing, given.problem), context, GIVEN)
+        return Completion(restore_pipeline(name, drawing_stages(stages), given.problem), context, GIVEN)
 
 
 def strike_tasks(
@@ -77,13 +77,12 @@ def strike_tasks(
     for name, values in zip(GIVEN, columns, strict=True):
         if values.shape[1] not in {1, count}:
             raise UsageError(f"{name} is given for {values.shape[1]:,} strikes, something else for {count:,}")
-    return completion({name: _repeated(values, count) for name, values in zip(GIVEN, columns, strict=True)})
+    return completion(dict(zip(GIVEN, columns, strict=True)))
 
 
 def boundary_of_tasks(tasks: TaskRound) -> Boundary:
     """Return the boundary conditions of the tasks that have an answer."""
-    names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
+    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in BOUNDARY))
 
 
 def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
@@ -95,8 +94,3 @@ def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
     if not math.isfinite(array.sum()) and not np.isfinite(array).all():
         raise UsageError(f"{name} must be finite, got {array}")
     return array.reshape(-1, array.shape[-1]).T
-
-
-def _repeated(values: Array, count: int) -> Array:
-    same = values if values.shape[1] == count else np.broadcast_to(values, (len(values), count))
-    return np.ascontiguousarray(same)

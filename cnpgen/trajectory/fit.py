@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.motion import Motion, lasting
 from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, clamped_knots
@@ -172,7 +172,7 @@ class _Fit:
 
     def _timed(self, rates: Array) -> Array:
         """Scale rates so that the motions last as long as the trajectory."""
-        return rates * (self._motion(rates).duration() / self.duration)[:, None]
+        return lasting(rates, self.duration, self.spec)
 
     def _motion(self, rates: Array) -> Motion:
         return Motion(np.zeros((len(rates), self.spec.path_control_points, 1)), rates, self.spec.degree)

@@ -245,6 +245,12 @@ class Motion:
         return [slice(first, first + size) for first in range(0, len(self), size)]
 
 
+def lasting(rate: Array, duration: Array | float, spec: TrajectorySpec) -> Array:
+    """Scale rate control points [1/s], shape (N, R), so that motions last a time [s], one number or shape (N,)."""
+    still = np.zeros((len(rate), spec.path_control_points, 1))
+    return rate * (Motion(still, rate, spec.degree).duration() / duration)[:, None]
+
+
 @cache
 def _shared_cells(points: int, degree: int) -> tuple[Array, Array]:
     """Return the edges of the cells of most motions, and ``_nodes`` of them."""

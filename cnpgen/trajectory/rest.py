@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.motion import Motion, lasting
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev
 
@@ -70,9 +70,7 @@ def _written(motion: Motion, t: Array, left: Array, boundary: Boundary, spec: Tr
     phases, rate_fit, path_basis, path_fit = _fits(spec, free.stop)
     begun = motion.phase_at(t[:, None])
     states = motion.at(begun + (1 - begun) * phases)
-    rate = states.rate / (1 - begun) @ rate_fit.T
-    still = np.zeros((len(rate), spec.path_control_points, 1))
-    rate *= (Motion(still, rate, spec.degree).duration() / left)[:, None]
+    rate = lasting(states.rate / (1 - begun) @ rate_fit.T, left, spec)
     path = assemble(boundary, np.zeros((len(rate), free.stop - 3, n)), rate, spec)
     path[:, free] = path_fit @ (states.q - path_basis @ path)
     return Motion(path, rate, spec.degree)

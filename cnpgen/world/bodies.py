@@ -6,13 +6,12 @@ bound of their signed distance. So no failure of Coal's makes bodies look furthe
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.shape.hull import coal_hull
+from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.world.scene import ENDLESS
 from cnpgen.world.sweep import sweep
@@ -28,7 +27,6 @@ Pairs = NDArray[np.intp]
 TOLERANCES = ((1e-9, 1e-6), (1e-6, 1e-6), (1e-6, 1e-4))
 CERTAIN = 1e-6  # m: what is measured and what is certified may differ by this much
 NO_SHAPE = 'a constraint is about the shape of the robot, which has none: it needs geometry = "urdf" in [robot]'
-_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Bodies:
         self._obstacles = tuple(obstacles)
         self._bodies = [_body(shape.joints[each.link], each.vertices, each.radius) for each in shape.pieces]
         boxes = range(len(self._bodies), len(self._bodies) + len(self._obstacles))
-        self._bodies += [_body(n_joints + 1 + i, _CORNERS * _size(box)) for i, box in enumerate(self._obstacles)]
+        self._bodies += [_body(n_joints + 1 + i, CUBE * _size(box)) for i, box in enumerate(self._obstacles)]
         moving = [index for index, each in enumerate(shape.pieces) if shape.joints[each.link]]
         self.from_obstacles = _pairs((box, piece) for piece in moving for box in boxes)
         self.among_links = _pairs(shape.apart)
@@ -179,9 +177,7 @@ class Bodies:
 
 
 def _body(frame: int, corners: Array, radius: float = 0.0) -> _Body:
-    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    reach = float(np.linalg.norm(corners - centre, axis=1).max()) + radius
-    return _Body(frame, corners, radius, centre, reach, coal_hull(corners))
+    return _Body(frame, corners, radius, *ball_round(corners, radius), coal_hull(corners))
 
 
 def _holding(shape: Shape, joint: int) -> tuple[int, Array]:
@@ -189,7 +185,7 @@ def _holding(shape: Shape, joint: int) -> tuple[int, Array]:
     moved = [piece for piece in shape.pieces if shape.joints[piece.link] == joint]
     low = np.min([piece.vertices.min(axis=0) - piece.radius for piece in moved], axis=0)
     high = np.max([piece.vertices.max(axis=0) + piece.radius for piece in moved], axis=0)
-    return joint, (low + high) / 2 + _CORNERS * (high - low)
+    return joint, (low + high) / 2 + CUBE * (high - low)
 
 
 def _pairs(found: Any) -> Pairs:

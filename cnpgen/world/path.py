@@ -1,13 +1,13 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
 from collections.abc import Sequence
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.world.bodies import NO_SHAPE, Bodies
 from cnpgen.world.scene import ENDLESS, Scene
 from cnpgen.world.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
-
-_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 class PathWorld:
@@ -247,7 +245,7 @@ class PathWorld:
         Raises:
             RecipeError: The problem has no object.
         """
-        offsets = _CORNERS * self._require_object()
+        offsets = CUBE * self._require_object()
         rotation, position = self.tip_rotation[..., which], self.tip_position[:, which]
         return np.asarray(np.tensordot(offsets, rotation, axes=(1, 1)) + position)
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.examples.shaped_robot import write_pipeline
+
 
 def folder() -> Path | None:
     """The folder in which ``package://example-robot-data`` begins."""
@@ -64,32 +66,16 @@ tolerance = "0 mm"
 use = "self-clearance"
 tolerance = "0 mm"
 """
-PANDA_PIPELINE = """
-name = "panda-shelves"
-problem = "problem.toml"
-[[stage]]
-use = "draw-positions"
-start = ["[0.4, 0.7] m", "[-0.4, -0.1] m", "[0.2, 0.6] m"]
-goal = ["[0.4, 0.7] m", "[0.1, 0.4] m", "[0.2, 0.6] m"]
-[[stage]]
-use = "start-ik"
-guess = [
+START = '["[0.4, 0.7] m", "[-0.4, -0.1] m", "[0.2, 0.6] m"]'
+GOAL = '["[0.4, 0.7] m", "[0.1, 0.4] m", "[0.2, 0.6] m"]'
+GUESS = """[
   "[-60, 60] deg", "[-60, 60] deg", "[-30, 30] deg", "[-150, -60] deg", "[-30, 30] deg", "[60, 140] deg", "[0, 90] deg",
-]
-[[stage]]
-use = "goal-ik"
-[[stage]]
-use = "at-rest"
-end = "start"
-[[stage]]
-use = "at-rest"
-end = "goal"
-"""
+]"""
 
 
 def write_panda(where: Path, robot: str = "") -> Path:
     """Write the problem and its pipeline; return the problem file."""
     joints = ", ".join(f'"panda_joint{number}"' for number in range(1, 8))
     (where / "problem.toml").write_text(PANDA.format(share=folder(), joints=joints, robot=robot))
-    (where / "pipeline.toml").write_text(PANDA_PIPELINE)
+    write_pipeline(where, name="panda-shelves", start=START, goal=GOAL, guess=GUESS)
     return where / "problem.toml"

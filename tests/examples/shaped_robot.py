@@ -63,6 +63,27 @@ top = 0.9
 height = 0.05
 """
 SELF = '[[constraint]]\nuse = "self-clearance"\ntolerance = 1e-4\n'
+_PIPELINE = """
+name = "{name}"
+problem = "problem.toml"
+[[stage]]
+use = "draw-positions"
+start = {start}
+goal = {goal}
+[[stage]]
+use = "start-ik"
+guess = {guess}
+{collision}
+[[stage]]
+use = "goal-ik"
+[[stage]]
+use = "at-rest"
+end = "start"
+[[stage]]
+use = "at-rest"
+end = "goal"
+{stop}
+"""
 
 
 def urdf(links: dict[str, list[str]] = LINKS) -> str:
@@ -107,4 +128,20 @@ def write_problem(
     write_crane(folder)
     file = folder / "problem.toml"
     file.write_text(PROBLEM.format(robot=robot, obstacles=obstacles, clearance=clearance, more=more))
+    return file
+
+
+def write_pipeline(
+    folder: Path,
+    *,
+    name: str = "crane",
+    start: str = "[[0.2, 0.7], [-0.5, -0.1], [0.1, 0.6]]",
+    goal: str = "[[0.2, 0.7], [0.1, 0.5], [0.1, 0.6]]",
+    guess: str = "[[-1.0, 1.0], [-1.0, 0.5], [0.0, 2.0], [-1.0, 1.0]]",
+    collision: str = "",
+    stop: str = "",
+) -> Path:
+    """Write a pipeline of motions from rest to rest for the problem in a folder; return the pipeline file."""
+    file = folder / "pipeline.toml"
+    file.write_text(_PIPELINE.format(name=name, start=start, goal=goal, guess=guess, collision=collision, stop=stop))
     return file

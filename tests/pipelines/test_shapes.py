@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.judges.rows.verify import verify_rows
-from cnpgen.kernels.library import KernelLibrary
-from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.context import Context, load_context
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.collision import Collision, capsule_clearance
@@ -15,32 +14,11 @@ from cnpgen.pipelines.stages.stage import Round
 from cnpgen.pipelines.undecided import settle, undecided
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
 from cnpgen.world.state import World
 from tests.conftest import Prepare, run_stages
-from tests.examples.shaped_robot import write_problem
+from tests.examples.shaped_robot import write_pipeline, write_problem
 
 TOPS = np.array([0.3, 0.9])
-PIPELINE = """
-name = "crane"
-problem = "problem.toml"
-[[stage]]
-use = "draw-positions"
-start = [[0.2, 0.7], [-0.5, -0.1], [0.1, 0.6]]
-goal = [[0.2, 0.7], [0.1, 0.5], [0.1, 0.6]]
-[[stage]]
-use = "start-ik"
-guess = [[-1.0, 1.0], [-1.0, 0.5], [0.0, 2.0], [-1.0, 1.0]]
-{collision}
-[[stage]]
-use = "goal-ik"
-[[stage]]
-use = "at-rest"
-end = "start"
-[[stage]]
-use = "at-rest"
-end = "goal"
-"""
 COLLISION = '[[stage]]\nuse = "collision"\nend = "start"\njudge = "segments"\n'
 
 
@@ -51,9 +29,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 
 @pytest.fixture(scope="module")
 def context(problem: Problem, cache_folder: Path) -> Context:
-    robot = load_robot(problem)
-    library = KernelLibrary("numpy", cache_folder, problem.identity, {"robot": robot, "problem": problem})
-    return Context(problem, robot, library)
+    return load_context(problem, "numpy", cache_folder)
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +97,8 @@ def test_the_capsules_clearance_is_a_lower_bound(context, drawn):
 @pytest.mark.parametrize("collision", ["", COLLISION])
 def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, prepare: Prepare, collision):
     write_problem(tmp_path)
-    (tmp_path / "pipeline.toml").write_text(PIPELINE.format(collision=collision))
-    prepared: PreparedPipeline = prepare(load_pipeline(tmp_path / "pipeline.toml"), "numpy")
+    pipeline = load_pipeline(write_pipeline(tmp_path, collision=collision))
+    prepared: PreparedPipeline = prepare(pipeline, "numpy")
     block = prepared.block(3, "train", 0, stop=300)
     columns = {name: values.T for name, values in block.columns.items()}
     report = verify_rows(prepared.context.problem, prepared.context.robot, columns)

@@ -13,8 +13,7 @@ from cnpgen.trajectory.motion import Motion
 from tests.conftest import needs_compiler
 from tests.examples.example_robots import folder, needs_robots, write_panda
 from tests.examples.meshes import Meshes, states
-from tests.examples.shaped_robot import write_problem
-from tests.pipelines.test_shapes import PIPELINE
+from tests.examples.shaped_robot import write_pipeline, write_problem
 
 pytestmark = needs_compiler
 
@@ -34,7 +33,7 @@ def valid_states(plans: Plans) -> list[np.ndarray]:
 
 def test_valid_plans_touch_nothing(tmp_path):
     problem = load_problem(write_problem(tmp_path))
-    (tmp_path / "pipeline.toml").write_text(PIPELINE.format(collision=""))
+    write_pipeline(tmp_path)
     meshes = Meshes(problem, load_robot(problem), tmp_path)
     found = valid_states(solved(tmp_path, 12))
     assert len(found) >= 8
@@ -45,8 +44,7 @@ def test_valid_plans_touch_nothing(tmp_path):
 
 def test_plans_may_have_to_stop_without_acceleration(tmp_path):
     write_problem(tmp_path)
-    text = PIPELINE.format(collision="").rstrip() + '\nacceleration = "zero"\n'
-    (tmp_path / "pipeline.toml").write_text(text)
+    write_pipeline(tmp_path, stop='acceleration = "zero"')
     plans = solved(tmp_path, 3)
     assert all(verdict.valid for verdict in evaluate_plans(plans, workers=1).verdicts)
     motion = Motion(plans.path_control_points, plans.rate_control_points, plans.degree)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
@@ -26,8 +27,7 @@ class BehindPuck(Stage):
         """The goal position, anywhere on the table."""
         table = context.constraint(Table)
         low, high = (table.x.low, table.y.low, table.z), (table.x.high, table.y.high, table.z)
-        text = "goal position of the tip"
-        return (Field("goal_xyz", "m", text, 3, ("x", "y", "z"), "context", "world", low, high),)
+        return (position_field("goal", low, high),)
 
     def prepare(self, context: Context) -> Work:
         """Nothing to load."""

@@ -1,5 +1,6 @@
 """Stage: draw the start and goal position of the tip."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,17 +29,7 @@ class DrawPositions(Stage):
         """Both positions."""
         del context
         return tuple(
-            Field(
-                f"{end}_xyz",
-                "m",
-                f"{end} position of the tip",
-                3,
-                ("x", "y", "z"),
-                "context",
-                "world",
-                tuple(axis.low for axis in box),
-                tuple(axis.high for axis in box),
-            )
+            position_field(end, [axis.low for axis in box], [axis.high for axis in box])
             for end, box in (("start", self.start), ("goal", self.goal))
         )
 
@@ -67,6 +58,12 @@ class DrawPositions(Stage):
                 )
         if mistakes:
             raise RecipeError(mistakes)
+
+
+def position_field(end: str, low: Sequence[float], high: Sequence[float]) -> Field:
+    """Describe the field of the tip's position at an end, within a box [m]."""
+    text = f"{end} position of the tip"
+    return Field(f"{end}_xyz", "m", text, 3, ("x", "y", "z"), "context", "world", tuple(low), tuple(high))
 
 
 def uniform(numbers: Array, ranges: tuple[Range, ...]) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
@@ -52,18 +53,7 @@ class GivenPositions(Stage):
         """Both positions, and the start configuration where it is the base."""
         boxes = (("start", self._starts(context)), ("goal", self._goals()))
         positions = tuple(
-            Field(
-                f"{end}_xyz",
-                "m",
-                f"{end} position of the tip",
-                3,
-                ("x", "y", "z"),
-                "context",
-                "world",
-                tuple(points.min(axis=0).tolist()),
-                tuple(points.max(axis=0).tolist()),
-            )
-            for end, points in boxes
+            position_field(end, points.min(axis=0).tolist(), points.max(axis=0).tolist()) for end, points in boxes
         )
         base = context.joint_field("start_q", "rad", "joint positions at the start")
         return positions if self.start else (*positions, base)

@@ -58,7 +58,7 @@ class SelfClearance(Constraint):
 
     def _least(self, distances: list[Any], radii: list[float], *, sufficient: bool) -> tuple[Condition, ...]:
         m = len(distances)
-        least, most = np.zeros(m) + (radii if m else 0.0) + self.distance, np.full(m, np.inf)
+        least, most = np.zeros(m) + radii + self.distance, np.full(m, np.inf)
         return (Condition("self clearance", "m", distances, least, most, "position", sufficient=sufficient),)
 
 

@@ -42,7 +42,7 @@ def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
     p, p1, p2, r, r1 = w[:n], w[n : 2 * n], w[2 * n : 3 * n], w[3 * n], w[3 * n + 1]
     dq = [a * r for a in p1]
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
-    size = problem.object.size if problem.object is not None else None
+    size = problem.object_size
     state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, size)
     g = []
     for constraint in problem.constraint:

@@ -1,5 +1,6 @@
 """Convex hulls: the corners of one, and one as Coal takes it."""
 
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # the corners of a cube of edge length 1 round the origin
 THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
 
 
@@ -31,6 +33,17 @@ def hull_corners(points: Array) -> Array:
             points = np.concatenate([points - THINNEST * axis, points + THINNEST * axis])
     corners: Array = points[np.sort(ConvexHull(points).vertices)]
     return corners
+
+
+def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
+    """Return the centre of a ball that holds a convex body [m], shape (3,), and its radius [m].
+
+    Args:
+        corners: Corners of the body's hull [m], shape (V, 3).
+        radius: How thick the hull is wrapped [m].
+    """
+    centre: Array = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(corners - centre, axis=1).max()) + radius
 
 
 def coal_hull(corners: Array) -> "coal.Convex":

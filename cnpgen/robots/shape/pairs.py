@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.shape.capsule import Capsule
-from cnpgen.robots.shape.hull import coal_hull
+from cnpgen.robots.shape.hull import ball_round, coal_hull
 from cnpgen.robots.shape.piece import Piece
 
 if TYPE_CHECKING:
@@ -111,9 +111,7 @@ class _Contact:
         for piece in pieces:
             shape = coal_hull(piece.vertices)
             shape.setSweptSphereRadius(piece.radius)
-            centre = (piece.vertices.min(axis=0) + piece.vertices.max(axis=0)) / 2
-            reach = float(np.linalg.norm(piece.vertices - centre, axis=1).max()) + piece.radius
-            self._of_link.setdefault(piece.link, []).append((centre, reach, shape))
+            self._of_link.setdefault(piece.link, []).append((*ball_round(piece.vertices, piece.radius), shape))
         self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
 
     def of(self, first: str, second: str) -> NDArray[np.bool_]:

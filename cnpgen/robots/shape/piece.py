@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.shape.inline import points_of
 from cnpgen.robots.urdf import urdf_tree
 
 Array = NDArray[np.float64]
 
 SIDES = 64  # of the prism round a cylinder, which it exceeds by 0.12 % of the radius
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def _core(shape: ElementTree.Element) -> tuple[Array, float]:
     if shape.tag == "mesh":
         return points_of(shape), 0.0
     if shape.tag == "box":
-        return _CORNERS * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
+        return CUBE * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
     if shape.tag not in ("sphere", "cylinder", "capsule"):
         raise ValueError(f"<{shape.tag}> is none of box, sphere, cylinder, capsule and mesh")
     radius = _positive(_numbers(shape, "radius", 1)[0])

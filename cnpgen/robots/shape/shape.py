@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -75,7 +75,7 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
     pieces, joints = _placed(link_pieces(urdf), model)
     if not any(joints.values()):
         raise RecipeError(["no link that moves has a <collision> element, so that the robot has no shape"])
-    numbers = [REVISION, urdf, list(model.names), *(list(limit) for limit in _limits(model))]
+    numbers = [REVISION, urdf, list(model.names), list(model.lowerPositionLimit), list(model.upperPositionLimit)]
     name = f"shape-{hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:32]}.json"
     if keep is not None:
         with suppress(OSError, ValueError, KeyError, TypeError):
@@ -103,11 +103,6 @@ def _placed(pieces: list[Piece], model: "pin.Model") -> tuple[tuple[Piece, ...],
         placed.append(piece.moved(np.array(frame.placement.rotation), np.array(frame.placement.translation)))
         joints[piece.link] = int(frame.parentJoint)
     return tuple(placed), joints
-
-
-def _limits(model: "pin.Model") -> Iterator[Any]:
-    yield model.lowerPositionLimit
-    yield model.upperPositionLimit
 
 
 def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
