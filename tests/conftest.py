@@ -9,7 +9,7 @@ os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: wo
 
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -33,6 +33,13 @@ SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
 TINY_SHARD = 250
 HANGING = 1800  # [s] what takes longer hangs, on the slowest machine, too
+
+
+def some(values: Iterable[Any], kept: int = 1) -> list[Any]:
+    """Parameters: the first few in every run, the others, which repeat the claim, in the extended run."""
+    extended = pytest.mark.extended
+    return [value if at < kept else pytest.param(value, marks=extended) for at, value in enumerate(values)]
+
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 

@@ -109,6 +109,15 @@ class KernelLibrary:
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
 
+    def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
+        """Return the operations of the SX function that ``builder`` builds; nothing is compiled.
+
+        Args:
+            builder: As for ``load``.
+            parameters: Likewise.
+        """
+        return self._tape(builder, self._given(builder), parameters)
+
     def _given(self, builder: Callable[..., Any]) -> dict[str, Any]:
         wanted = inspect.signature(builder).parameters
         return {name: value for name, value in self.arguments.items() if name in wanted}

@@ -61,5 +61,5 @@ def make_funnel(problem: Problem, robot: "Robot", form: str) -> Funnel:
     tops = ca.vertsplit(ca.SX.sym("tops", len(problem.obstacle)))
     size = problem.object_size
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
-    chosen = (pair for pair in stated(problem, state, form) if has_funnel(pair[0]))
+    chosen = stated(filter(has_funnel, problem.constraint), state, form)
     return Funnel(tuple((constraint, condition) for constraint, conditions in chosen for condition in conditions))

@@ -4,6 +4,7 @@ Terms are the task loss and one per constraint of the problem, all times ``dt/ds
 functions) and the quadrature weight of the node.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -99,9 +100,11 @@ def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
     return ca.Function("loss_gradient", inputs.columns, ca.cse(results))
 
 
-def stated(problem: Problem, state: SymbolicState, form: str) -> list[tuple[Constraint, tuple[Condition, ...]]]:
+def stated(
+    constraints: Iterable[Constraint], state: SymbolicState, form: str
+) -> list[tuple[Constraint, tuple[Condition, ...]]]:
     """State what is penalised, constraint by constraint."""
-    return [(each, published(each, state) if form == "paper" else each.penalised(state)) for each in problem.constraint]
+    return [(each, published(each, state) if form == "paper" else each.penalised(state)) for each in constraints]
 
 
 def has_funnel(constraint: Constraint) -> bool:
@@ -119,7 +122,7 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldSta
     tops, size = sym("tops", len(problem.obstacle)), problem.object_size
     q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
     state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size)
-    pairs = stated(problem, state, form)
+    pairs = stated(problem.constraint, state, form)
     count = sum(len(condition.g) for each, conditions in pairs if has_funnel(each) for condition in conditions)
     wider, tightening = sym("wider", count), sym("tightening", 2 * m)
     inputs = Inputs(p, dp, ddp, rate, tops, wider, sym("node"), tightening, sym("weights", m))

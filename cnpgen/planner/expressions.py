@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
@@ -69,10 +70,9 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
 
 
-def count_equalities(robot: "Robot", problem: Problem) -> int:
-    """Count the rows of ``equality_residuals``."""
-    found = _any_conditions(robot, problem)
-    return sum(len(condition.g) for condition, needs in found if needs == 0 and condition.is_equality)
+def has_equalities(kernels: KernelLibrary) -> bool:
+    """Whether ``equality_residuals`` of the problem of some kernels has rows; CasADi is asked once per problem."""
+    return kernels.tape(equality_residuals).outputs[0] > 0
 
 
 def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.curves import landed_path
-from cnpgen.planner.expressions import count_equalities
+from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.model import Model
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
@@ -122,7 +122,7 @@ def make_kit(given: Surroundings, *, bending_steps: int, landing_steps: int, slo
         slow_down: Whether motions are slowed down; only for those from rest to rest.
     """
     problem, robot, kernels = given.problem, given.robot, given.kernels
-    bent = count_equalities(robot, problem) > 0
+    bent = has_equalities(kernels)
     with kernels.compiling_together():
         prepare = prepare_tasks(problem, robot, kernels, bending_steps=bending_steps if bent else 0)
         path = kernels.load(landed_path, steps=landing_steps if bent else 0)

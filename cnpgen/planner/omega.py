@@ -17,7 +17,7 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.curves import FIXED_AT_GOAL
-from cnpgen.planner.expressions import count_equalities
+from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import Tasks
@@ -87,7 +87,7 @@ class Omega:
     @cached_property
     def _built(self) -> tuple[Preparation, Landing | None]:
         robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
-        bent = count_equalities(robot, problem) > 0
+        bent = has_equalities(kernels)
         with kernels.compiling_together():
             prepare = prepare_tasks(problem, robot, kernels, bending_steps=self._bending if bent else 0)
             return prepare, make_landing(problem, kernels, steps=self._landed) if bent and self._landed else None

@@ -12,7 +12,7 @@ from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.expressions import count_equalities
+from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
@@ -103,7 +103,7 @@ def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Bou
 
 
 def _landing(given: Surroundings, settings: TrainingSettings) -> Landing | None:
-    if settings.landing_steps == 0 or count_equalities(given.robot, given.problem) == 0:
+    if settings.landing_steps == 0 or not has_equalities(given.kernels):
         return None
     return make_landing(given.problem, given.kernels, steps=settings.landing_steps)
 

@@ -17,7 +17,7 @@ import cnpgen
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible, raise_if_interrupted
 from cnpgen.cli.main import main
 from cnpgen.kernels.compiled import find_compiler
-from tests.conftest import HANGING
+from tests.conftest import HANGING, some
 from tests.machine.test_workers import alive
 
 KEPT = "finished shards are kept, run the same command again to go on"
@@ -73,7 +73,7 @@ def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list
 
 
 @linux
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", some([2, 1]))
 @pytest.mark.parametrize("number", NAMES)
 def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(tmp_path, number, workers):
     folder = tmp_path / "out"
@@ -92,7 +92,7 @@ def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(tmp_pa
 
 @linux
 @pytest.mark.parametrize("number", NAMES)
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", some(range(2)))
 def test_a_signal_to_all_processes_while_workers_start_gives_no_traceback(tmp_path, number, seed):
     folder = tmp_path / "out"
     with making(folder, 2) as process:

@@ -7,6 +7,7 @@ import pytest
 
 from cnpgen.judges.plans.limits import is_proven
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque
+from tests.conftest import some
 from tests.examples.plans import Plan, bent, course, load
 
 NAMES = {"position": "q", "velocity": "dq", "acceleration": "ddq"}
@@ -24,9 +25,9 @@ def beyond(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.ndarra
     return np.abs(values) - limit[:, None], limit
 
 
-@pytest.mark.parametrize("label", ["hit", "replan", "transport"])
+@pytest.mark.parametrize("label", some(["replan", "transport", "hit"], 2))
 @pytest.mark.parametrize("quantity", NAMES)
-@pytest.mark.parametrize("by", [0.0, 0.2])
+@pytest.mark.parametrize("by", some([0.2, 0.0]))
 def test_the_margin_of_a_limit_is_the_worst_of_a_very_fine_grid(label: str, quantity: str, by: float) -> None:
     plan = bent(load(label), by, seed=2)
     margin = plan.judged().margins[f"joint {quantity}"]
@@ -45,7 +46,7 @@ def test_what_lies_between_moments_counts() -> None:
     worst = (found / scale[:, None]).max()
     for more, wanted in ((1e-6, False), (-1e-6, True)):
         judged = plan.with_constraint("JointAcceleration", tolerance=worst - more)
-        for step in (1e-2, 1e-3, 1e-4):
+        for step in (1e-2, 1e-3):
             assert judged.judged(step=step).margins["joint acceleration"].ok is wanted
 
 

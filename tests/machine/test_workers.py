@@ -15,7 +15,7 @@ import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.machine.workers import share_out, signals_held, worker_count
-from tests.conftest import HANGING
+from tests.conftest import HANGING, some
 from tests.examples.tiny_datasets import digests, make_tiny
 
 ROOT = Path(__file__).parents[2]
@@ -212,7 +212,7 @@ def alive(pid: int) -> bool:
 
 
 @linux
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", some([signal.SIGKILL, signal.SIGTERM, signal.SIGHUP]))
 def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, number):
     if signal.getsignal(number) is signal.SIG_IGN:
         pytest.skip("the tests run under nohup, and so do those that they start")

@@ -21,7 +21,7 @@ from cnpgen.store.fates import Fates
 from cnpgen.store.layout import MANIFEST
 from cnpgen.validate.dataset import validate_dataset
 from tests.cli.test_interruption import descendants
-from tests.conftest import TINY_SHARD, columns_of, tiny_recipe
+from tests.conftest import TINY_SHARD, columns_of, some, tiny_recipe
 from tests.examples.tiny_datasets import SHARDS, digests, make_tiny
 
 ROOT = Path(__file__).parents[2]
@@ -89,7 +89,7 @@ def running(folder: Path, *, workers: int, shard_size: int = TINY_SHARD) -> Iter
 
 
 @linux
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", some([2, 1]))
 def test_a_killed_run_is_finished_with_the_same_bytes(tiny, tmp_path, workers):
     folder = tmp_path / "out"
     with running(folder, workers=workers) as process:
@@ -115,14 +115,14 @@ def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
             for pid in killed:
                 os.kill(pid, signal.SIGKILL)
 
-    recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24_000, "validation": 2000})
+    recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 12_000, "validation": 1000})
     folder = tmp_path / "out"
     with pytest.raises(
         MachineError, match=r"a worker died .*finished are safe in .*run make_dataset or 'cnpgen make-dataset' again"
     ):
         make_dataset(recipe, folder, shard_size=1000, workers=2, progress=kill)
     assert len(killed) == 2
-    assert 1 <= len(digests(folder)) < 26
+    assert 1 <= len(digests(folder)) < 13
     assert make_dataset(recipe, folder, workers=1).complete
     make_dataset(recipe, tmp_path / "uncut", shard_size=1000, workers=1)
     assert digests(folder) == digests(tmp_path / "uncut")

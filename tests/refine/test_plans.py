@@ -26,7 +26,7 @@ from cnpgen.problems.record import open_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.plans import refine_plans, solve_plans
 from cnpgen.refine.task import Outcome
-from tests.conftest import HANGING
+from tests.conftest import HANGING, some
 
 N, HITS = 13, 16
 SOME = 6_000  # [bytes] of a journal: some plans, and not all
@@ -357,7 +357,7 @@ def test_bad_arguments_are_one_line_and_leave_nothing_behind(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", some([signal.SIGKILL, signal.SIGTERM]))
 def test_a_killed_solve_loses_nothing_that_was_finished(number: int, hits: Plans, tmp_path: Path) -> None:
     out = tmp_path / "plans.h5"
     words = [
