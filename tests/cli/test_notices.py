@@ -12,7 +12,6 @@ from cnpgen.plans import save_plans
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load
 
-
 CHECKED = "FOLDER/plans.h5: the file's checksum is right"
 
 
