@@ -2,9 +2,10 @@
 
 import multiprocessing
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from multiprocessing.connection import Connection
@@ -61,7 +62,7 @@ class PlannerProcess:
 
     def __init__(self, name: str, setting: Setting) -> None:
         self._name, self._setting = name, setting
-        self._process: Any = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
 
     def plan(self, problem: Plans) -> Attempt:
@@ -87,7 +88,7 @@ class PlannerProcess:
         """End the process."""
         if self._process is not None:
             self._process.kill()
-            self._process.join()
+            self._process.wait()
         if self._pipe is not None:
             self._pipe.close()
         self._process = self._pipe = None
@@ -95,14 +96,14 @@ class PlannerProcess:
     def _started(self) -> Connection:
         if self._pipe is not None:
             return self._pipe
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._name, self._setting), daemon=True)
-        with _hidden_main():
-            self._process.start()
-        theirs.close()
+        self._pipe, theirs = multiprocessing.Pipe()
+        with theirs:  # no multiprocessing.Process: workers of dask may not start one, and it runs the caller's script
+            program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({theirs.fileno()})"
+            command = [sys.executable, "-c", program]
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
         said: str | None = "it did not begin"
         with suppress(EOFError, OSError):
+            self._pipe.send((self._name, self._setting))
             if self._pipe.poll(STARTING):
                 said = self._pipe.recv()
         if said is not None:
@@ -111,32 +112,21 @@ class PlannerProcess:
         return self._pipe
 
 
-@contextmanager
-def _hidden_main() -> Iterator[None]:
-    """Keep the new process from importing the caller's script, which may have no guard against running twice."""
-    import sys
+def serve(descriptor: int) -> None:
+    """Prepare the planner that is named through a pipe, and plan for what comes next, until it is closed.
 
-    main = sys.modules["__main__"]
-    kept = {name: getattr(main, name) for name in ("__file__", "__spec__") if hasattr(main, name)}
-    for name in kept:
-        setattr(main, name, None)
-    try:
-        yield
-    finally:
-        for name, value in kept.items():
-            setattr(main, name, value)
-
-
-def _serve(pipe: Connection, name: str, setting: Setting) -> None:
-    """Prepare a planner and plan for what comes through the pipe, until it is closed."""
+    Args:
+        descriptor: Of the pipe.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides
-    try:
-        plan = registry.load(registry.PLANNERS, name)().prepare(setting)
-    except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
-        pipe.send(_said(error))
-        return
-    pipe.send(None)
-    with suppress(EOFError, OSError):
+    with Connection(descriptor) as pipe, suppress(EOFError, OSError):
+        name, setting = pipe.recv()
+        try:
+            plan = registry.load(registry.PLANNERS, name)().prepare(setting)
+        except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
+            pipe.send(_said(error))
+            return
+        pipe.send(None)
         while True:
             pipe.send(_attempt(plan, pipe.recv()))
 

@@ -1,6 +1,6 @@
 """Running a benchmark: every planner on every problem, judged and, if wanted, executed; what is finished stays."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,8 +19,8 @@ from cnpgen.benchmark.suite import Suite, load_suite
 from cnpgen.benchmark.turns import Lead
 from cnpgen.errors import UsageError, nearest
 from cnpgen.judges.plans.verdict import Verdict
+from cnpgen.machine.engine import Engine, Team, assembled
 from cnpgen.machine.versions import __version__
-from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import resolved
 from cnpgen.schema import registry
@@ -29,10 +29,17 @@ from cnpgen.simulator.execute import load_mujoco
 from cnpgen.simulator.plant import Plant, as_plant
 from cnpgen.store.files.documents import canonical_sha256, plain
 
+PART = 4  # problems that one of several planners of a kind plans for: its start takes some seconds
 FASTEST = ("cnp-b", "cnp-b+refine", "solve")  # what runs where nothing else is said: the others take longer
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many steps it has, and how many of them are done."""
+
+Numbered = tuple[int, Plans]
+"""The number of a problem and the problem."""
+
+Rows = Generator[dict[str, Any], None, None]
+"""What became of problems, as it is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +81,16 @@ def run_benchmark(
     plants: Sequence[str | Plant] = (),
     time_limit: float = 60.0,
     workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Benchmark:
     """Compare planners; a run that was interrupted goes on where it was.
 
     Every planner plans for one problem after the other, in a process of its own on one thread: its times are not
-    disturbed by others of the same run. Plans are executed in as many processes as are wanted.
+    disturbed by others of the same run. Plans are executed in as many processes as are wanted. With an engine, its
+    workers plan, too, each for other problems: planning times are then those of a shared machine.
 
     Args:
         suite: A suite, or the name or the file of one, or of a dataset.
@@ -89,7 +99,9 @@ def run_benchmark(
         n: Only the first so many problems; of a random suite it may be more.
         plants: Plants that plans are executed on; none by default.
         time_limit: How long a planner may take for a problem [s]; those that cannot tell the time may take longer.
-        workers: Processes that execute plans; default one per available core.
+        workers: Processes that execute plans, and with an engine plan; default one per available core.
+        engine: Where the workers run, as of ``make_dataset``; by default plans are made on this machine, one by one.
+        address: Likewise.
         force: Whether results of another suite, version or time limit may be thrown away.
         progress: Called after every problem.
 
@@ -97,8 +109,9 @@ def run_benchmark(
         UsageError: There is no such planner or plant, it cannot plan for such problems, or the folder has results of
             another run.
         RecipeError: The suite has mistakes.
-        MachineError: MuJoCo is missing, or the results cannot be written.
+        MachineError: MuJoCo is missing, the results cannot be written, or a cluster cannot be reached.
     """
+    where = Engine(engine, address, workers)
     loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     _check_planners(planners)
     robots = tuple(as_plant(plant) for plant in plants)
@@ -113,14 +126,16 @@ def run_benchmark(
     place.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda *_: None)
     rows = {}
-    for name in planners:
-        results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), discard=force)
-        _plan_all(results, name, setting, problems, tell)
-        for plant in robots:
-            _execute_all(
-                results, plant, problems, lead, workers=workers, tell=partial(tell, f"{name}, {plant.name} plant")
-            )
-        rows[name] = [results.rows[index] for index in range(len(problems))]
+    with assembled(where, len(problems)) as team:
+        for name in planners:
+            results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), discard=force)
+            planned = _planned_here if engine is None else partial(_planned_by, team)
+            _plan_all(results, problems, partial(planned, name, setting), partial(tell, f"{name} plans"))
+            for plant in robots:
+                _execute_all(
+                    results, plant, problems, lead, team=team, tell=partial(tell, f"{name}, {plant.name} plant")
+                )
+            rows[name] = [results.rows[index] for index in range(len(problems))]
     return Benchmark(loaded, problems, lead, rows, tuple(plant.name for plant in robots))
 
 
@@ -147,19 +162,40 @@ def _identity(suite: Suite, planner: str, time_limit: float) -> dict[str, Any]:
     }
 
 
-def _plan_all(results: Results, name: str, setting: Setting, problems: Plans, tell: Progress) -> None:
+def _plan_all(
+    results: Results, problems: Plans, planned: Callable[[list[Numbered]], Rows], tell: Callable[[int, int], None]
+) -> None:
     """Let a planner plan for the problems that have no result yet."""
-    waiting = list(results.missing(len(problems)))
+    waiting = [(index, problems[index]) for index in results.missing(len(problems))]
     if not waiting:
         return
+    with closing(planned(waiting)) as rows:
+        for done, row in enumerate(rows, start=len(problems) - len(waiting) + 1):
+            results.append(row)
+            tell(len(problems), done)
+
+
+def _planned_here(name: str, setting: Setting, waiting: list[Numbered]) -> Rows:
+    """Yield what becomes of problems, one after the other."""
     process = PlannerProcess(name, setting)
     try:
-        for done, index in enumerate(waiting, start=len(problems) - len(waiting) + 1):
-            attempt = process.plan(problems[index])
-            results.append(_row(index, problems[index], attempt))
-            tell(f"{name} plans", len(problems), done)
+        for index, problem in waiting:
+            yield _row(index, problem, process.plan(problem))
     finally:
         process.stop()
+
+
+def _planned_by(team: Team, name: str, setting: Setting, waiting: list[Numbered]) -> Rows:
+    """Yield what becomes of problems that are shared out to a team, a few at a time."""
+    size = min(PART, -(-len(waiting) // team.size))
+    parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
+    with closing(team.share_out(partial(_planned_part, name, setting), parts)) as found:
+        for rows in found:
+            yield from ({**row, "planners_at_once": team.size} for row in rows)
+
+
+def _planned_part(name: str, setting: Setting, part: list[Numbered]) -> list[dict[str, Any]]:
+    return list(_planned_here(name, setting, part))
 
 
 def _row(index: int, problem: Plans, attempt: Attempt) -> dict[str, Any]:
@@ -200,7 +236,7 @@ def _execute_all(
     problems: Plans,
     lead: Lead | None,
     *,
-    workers: int | None,
+    team: Team,
     tell: Callable[[int, int], None],
 ) -> None:
     """Execute the plans that were not executed on this plant yet."""
@@ -208,8 +244,7 @@ def _execute_all(
     if not waiting:
         return
     tasks = (_task(problems[index], results.rows[index], lead and lead[index]) for index in waiting)
-    count = worker_count(workers, len(waiting))
-    with closing(share_out(partial(execute_answer, plant=plant), tasks, count, ordered=True)) as found:
+    with closing(team.share_out(partial(execute_answer, plant=plant), tasks, ordered=True)) as found:
         for done, (index, executed) in enumerate(zip(waiting, found, strict=True), start=1):
             results.append({"problem": index, "executed": {plant.name: executed.to_dict()}})
             tell(len(waiting), done)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
@@ -17,7 +17,8 @@ _TEXT = """\
 Every planner plans for one problem after the other, in a process of its own and on one thread; Pinocchio and Coal judge
 what it returns, and with --simulate MuJoCo executes it. What is finished is written to DIR at once, a file per planner:
 after Ctrl-C, kill -9 or a full disk the same command goes on, and with more --planners or --plant it adds to what is
-there. A planner that crashes, runs out of time or returns garbage costs its own row. docs/benchmark.md says what the
+there. A planner that crashes, runs out of time or returns garbage costs its own row. With --engine the workers of this
+machine or of a cluster plan at once: their times are those of shared machines. docs/benchmark.md says what the
 suites and the planners are. The exit code is 0 if the benchmark is complete, whatever the planners did.
 """
 
@@ -34,9 +35,9 @@ def add(commands: "Commands[Parser]") -> None:
     option("--simulate", action="store_true", help="execute the plans, too")
     option("--plant", metavar="NAME", nargs="+", help="the robots that execute them (default: nominal)")
     option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="for each problem (default: 60s)")
-    option(
-        "--workers", metavar="W", type=values.positive, help="processes that execute; default one per available core"
-    )
+    text = "processes that execute, and with --engine plan; default one per available core"
+    option("--workers", metavar="W", type=values.positive, help=text)
+    add_engine(parser)
     option("--force", action="store_true", help="throw away results of another suite, version or time limit in DIR")
     add_json(parser)
 
@@ -81,6 +82,8 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             plants=(arguments.plant or ("nominal",)) if arguments.simulate else (),
             time_limit=arguments.time_limit,
             workers=arguments.workers,
+            engine=arguments.engine,
+            address=arguments.address,
             force=arguments.force,
             progress=progress,
         )

@@ -22,6 +22,11 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
     return plans
 
 
+def checksum_text(plans: "Plans") -> str:
+    """Say whether the file that plans were read from has a checksum."""
+    return "the file's checksum is right" if plans.sealed else "the file has no checksum"
+
+
 def check_suffix(out: Path) -> None:
     """Refuse a file for plans that does not end as they do."""
     from cnpgen.errors import UsageError

@@ -1,10 +1,11 @@
 """``cnpgen refine``: polish the plans of a file."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.plan_files import read_plans
+from cnpgen.cli.plan_files import checksum_text, read_plans
 from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
 
 _TEXT = (
@@ -32,4 +33,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     plans = read_plans(arguments.file, problem=arguments.problem)
     out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
+    if not arguments.quiet:
+        print(f"{arguments.file}: {checksum_text(plans)}", file=sys.stderr)
     return refine_and_save(arguments, plans, out, title=f"refining {arguments.file}")

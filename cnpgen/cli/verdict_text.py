@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli.describe import table
+from cnpgen.cli.plan_files import checksum_text
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
@@ -32,12 +33,11 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     summary, count = found.summary(), len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, looked at every {step} or more often"
-    seal = "the file's checksum is right" if found.plans.sealed else "the file has no checksum"
     tallies = [
         (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
         for name, text in _TALLIES.items()
     ]
-    sections = [[head, seal, "", *table(tallies, indent="  ", right=(1, 2))]]
+    sections = [[head, checksum_text(found.plans), "", *table(tallies, indent="  ", right=(1, 2))]]
     tables = (_reasons(found, summary), (1,)), (_figures(summary), range(1, 7)), (_margins(summary), (1, 2, 3, 5, 6))
     sections += [table(rows, indent="  ", right=tuple(right)) for rows, right in tables if len(rows) > 1]
     return "\n\n".join("\n".join(lines) for lines in sections)

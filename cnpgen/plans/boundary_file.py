@@ -36,11 +36,13 @@ class BoundaryFile:
         path: The file.
         attributes: Those of ``SAID`` that it has.
         columns: Those of ``ASKED`` that it has: name -> values.
+        sealed: Whether it has a checksum, which is right, as files of plans have.
     """
 
     path: Path
     attributes: Mapping[str, Any]
     columns: Mapping[str, NDArray[Any]]
+    sealed: bool
 
     @property
     def is_shard(self) -> bool:
@@ -107,14 +109,14 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     require_file(path, "a dataset or an HDF5 file of boundary conditions")
     if (kind := file_kind(path)).endswith(" of cnpgen"):
         raise DatasetError(f"{path} is {kind}, not an HDF5 file of boundary conditions")
-    has_seal(path, kind=PLANS, version=PLANS_VERSION)
+    sealed = has_seal(path, kind=PLANS, version=PLANS_VERSION)
     with opened_hdf5(path) as file:
         attributes = file.attributes.some(SAID)
         columns = {name: file[name].read() for name in ASKED if name in file}
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
         raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan")
-    return BoundaryFile(path, attributes, columns)
+    return BoundaryFile(path, attributes, columns, sealed)
 
 
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:

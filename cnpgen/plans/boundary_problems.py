@@ -3,6 +3,7 @@
 Rows of a certified dataset have their plans already.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,9 +110,10 @@ def _of_file(path: Path, wanted: ProblemRecord | None) -> Plans:
     conditions = {name: values for name, values in vars(boundary).items() if values is not None}
     columns = {**file.columns, **conditions, "sample_id": file.sample_id(len(boundary))}
     try:
-        return plans_of_rows(problem, columns, source=f"boundary conditions in {path.name}")
+        plans = plans_of_rows(problem, columns, source=f"boundary conditions in {path.name}")
     except UsageError as error:
         raise DatasetError(f"{path}: {error}") from error
+    return replace(plans, sealed=file.sealed)
 
 
 def plans_of_rows(problem: ProblemRecord, columns: "Mapping[str, NDArray[Any]]", *, source: str = "") -> Plans:

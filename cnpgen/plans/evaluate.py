@@ -69,7 +69,7 @@ class Evaluation:
             "format_version": FORMAT_VERSION,
             "problem": record.name,
             "problem_sha256": record.comparable_sha256,
-            "checksum": "right" if self.plans.sealed else "none",
+            "checksum": self.plans.checksum,
             "step_s": self.step,
             **summarise(self.verdicts),
         }

@@ -57,6 +57,11 @@ class Plans:
     refined_with: str = ""
     sealed: bool = False
 
+    @property
+    def checksum(self) -> str:
+        """What is said of it in summaries: "right", or "none" if their file has none, or they are from no file."""
+        return "right" if self.sealed else "none"
+
     def __post_init__(self) -> None:
         integer("degree", self.degree, least=3, most=MOST_DEGREE)
         mistake = next(_mistakes(self), None)

@@ -69,6 +69,7 @@ class Refinement:
         return {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
+            "checksum": self.given.checksum,
             "plans": len(self.refined),
             "valid": int(self.valid.sum()),
             "outcomes": _counted(each.outcome.name.lower() for each in self.refined),
@@ -235,6 +236,7 @@ def _assembled(given: Plans, refined: list[Refined], options: RefineOptions) -> 
         rate_control_points=np.stack([each.rate for each in refined]),
         columns={**given.columns, **_columns(refined)},
         refined_with=json.dumps({"cnpgen": __version__, **options.said()}),
+        sealed=False,
     )
     valid, screened = np.array([each.valid for each in refined]), screen(plans)
     status = np.where(valid, PlanStatus.VALID, np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened))

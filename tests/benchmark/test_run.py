@@ -93,6 +93,21 @@ def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) ->
     assert "<svg" in report
 
 
+@pytest.mark.parametrize(
+    "engine", ["loky", *(pytest.param(name, marks=pytest.mark.extended) for name in ("dask", "ray"))]
+)
+@pytest.mark.filterwarnings("default")  # of dask's and ray's own
+def test_planners_that_plan_at_once_return_what_one_returns(tmp_path: Path, engine: str) -> None:
+    pytest.importorskip({"loky": "joblib", "dask": "distributed"}.get(engine, engine))
+    (alone,) = run_benchmark("hits-81", tmp_path / "alone", planners=["cnp-b"], n=3).results.values()
+    (found,) = run_benchmark(
+        "hits-81", tmp_path / "at once", planners=["cnp-b"], n=3, engine=engine, workers=2
+    ).results.values()
+    assert [row["planners_at_once"] for row in found] == [2] * 3
+    for what in ("problem", "answer", "verdict"):
+        assert [row[what] for row in found] == [row[what] for row in alone]
+
+
 def test_results_of_another_run_are_not_mixed_in(tmp_path: Path) -> None:
     run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)
     with pytest.raises(UsageError, match="holds results of another run"):

@@ -56,6 +56,7 @@ COMMANDS = {
     "validate": ["{tiny}", "--deep"],
     "solve": ["{tiny}", "--n", "2", "-o", "{out}"],
     "refine": ["{plans}", "-o", "{out}"],
+    "benchmark": ["hits-81", "--n", "1", "-o", "{out}"],
 }
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import joblib
 import pytest
 
+import cnpgen
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.machine.workers import share_out, signals_held, worker_count
 from tests.conftest import HANGING, some
@@ -272,6 +273,28 @@ def test_dask_makes_the_same_bytes(tiny, tmp_path, cluster):
         made = make_tiny(tmp_path / "out", workers=2)
     assert made.complete
     assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+def test_ray_makes_the_same_bytes_and_plans_as_a_backend_of_joblib(tiny, tmp_path):
+    ray = pytest.importorskip("ray")
+    from ray.util.joblib import register_ray
+
+    problems = cnpgen.draw_boundary_problems("airhockey-hit", 6, seed=3)
+    here = cnpgen.solve_plans(problems, workers=1)
+    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        register_ray()
+        with joblib.parallel_config(backend="ray"):
+            made = make_tiny(tmp_path / "out", workers=2)
+            there = cnpgen.solve_plans(problems, workers=2)
+            assert cnpgen.validate_dataset(tmp_path / "out", deep=True, workers=2).ok
+    finally:
+        ray.shutdown()
+    assert made.complete
+    assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
+    assert (there.plans.path_control_points == here.plans.path_control_points).all()
 
 
 def die_once(marker: Path, task: int) -> int:

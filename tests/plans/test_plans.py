@@ -31,6 +31,7 @@ from cnpgen.plans import (
     save_plans,
     screen,
 )
+from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.export import export_plans
 from cnpgen.problems.load import load_problem
@@ -437,6 +438,7 @@ def test_the_reader_says_whether_a_file_has_a_checksum(tmp_path: Path) -> None:
     found = load_plans(tmp_path / "plan.h5")
     assert found.sealed
     assert found[:2].sealed
+    assert load_boundary_problems(tmp_path / "plan.h5").sealed
     assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "right"
     assert not plans.sealed
     with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:

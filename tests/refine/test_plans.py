@@ -27,6 +27,7 @@ from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.plans import refine_plans, solve_plans
 from cnpgen.refine.task import Outcome
 from tests.conftest import HANGING, some
+from tests.examples.plan_files import unsealed
 
 N, HITS = 13, 16
 SOME = 6_000  # [bytes] of a journal: some plans, and not all
@@ -278,7 +279,8 @@ def test_ctrl_c_while_problems_are_explained_loses_nothing(
     assert "run the same command again" in capsys.readouterr().err
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["hard.h5", "out.h5.part"]
     assert main(command) == 1
-    begun, explaining, *said = capsys.readouterr().err.splitlines()
+    checked, begun, explaining, *said = capsys.readouterr().err.splitlines()
+    assert checked.endswith("hard.h5: the file's checksum is right")
     assert begun.endswith("1 plan, 1 there already")
     assert explaining == "explaining: 1 plan"
     assert "infeasible" in " ".join(said)
@@ -299,9 +301,14 @@ def test_solve_and_refine_write_files_that_evaluate_calls_valid(
     assert main(["refine", str(out), "--json", "--quiet"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["seconds"]["computing"] > 0
-    assert (said["plans"], said["valid"], said["not_valid"]) == (3, 3, [])
+    assert (said["plans"], said["valid"], said["not_valid"], said["checksum"]) == (3, 3, [], "right")
     assert main(["evaluate", said["file"]]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans-refined.h5", "plans.h5"]
+    capsys.readouterr()
+    assert main(["refine", str(unsealed(out)), "--json", "--force"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["checksum"] == "none"
+    assert f"{out}: the file has no checksum\n" in told.err
 
 
 def test_nothing_is_replaced_without_force(problems: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
