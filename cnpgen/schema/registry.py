@@ -68,6 +68,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "aqp": "cnpgen.benchmark.planners.aqp:AQP",
         "cbirrt": "cnpgen.benchmark.planners.cbirrt:CBiRRT",
         "sst": "cnpgen.benchmark.planners.sst:SST",
+        "mpc-mpnet": "cnpgen.benchmark.planners.mpc_mpnet:MPCMPNet",
     },
 }
 

@@ -13,7 +13,6 @@ from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path, striking_path
-from cnpgen.benchmark.planners.sst import Tree
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.planners.trajopt import TrajOpt, Transcription
 from cnpgen.benchmark.process import PlannerProcess
@@ -168,23 +167,3 @@ def test_planners_know_the_tip_if_a_joint_has_its_name() -> None:
     robot = open_problem(replace(task.problem, urdf=urdf))[1]
     tip = Tip(robot).at(task.boundary.start_q[0])[0]
     np.testing.assert_allclose(tip, task.problem.tip_positions(task.boundary.start_q)[0], atol=1e-12)
-
-
-def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cnpgen.benchmark.planners.sst.ITERATIONS", 3000)
-    task = one_of("hits-81", 40)
-    problem, robot = open_problem(task.problem)
-    tree = Tree(problem, robot, task, np.random.default_rng(0))
-    found = tree.grow(60)
-    assert found is not None
-    assert found.dq is not None
-    tip = task.problem.tip_positions(found.q)
-    goal = task.columns["goal_xyz"][0]
-    assert np.linalg.norm(tip[-1] - goal) < np.linalg.norm(tip[0] - goal) - 0.01
-    assert np.abs(tip[:, 2] - 0.16).max() <= 0.01
-    assert np.all(np.abs(found.dq) <= robot.velocity_limit)
-    ddq = np.diff(found.dq, axis=0) / np.diff(found.t)[:, None]
-    assert np.all(np.abs(ddq) <= robot.acceleration_limit * (1 + 1e-9))
-    step = np.diff(found.q, axis=0) - np.diff(found.t)[:, None] * (found.dq[1:] + found.dq[:-1]) / 2
-    assert np.abs(step).max() < 1e-12  # accelerations are constant over every step
-    np.testing.assert_array_equal(found.q[0], task.boundary.start_q[0])

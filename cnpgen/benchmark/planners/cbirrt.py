@@ -89,10 +89,6 @@ class Search:
             ends = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             self._size, self._boxes = boxes_of(problem, *ends)
 
-    def tip(self, q: Array) -> Array:
-        """Return where the tip is [m], shape (3,)."""
-        return self._tip.at(q)[0]
-
     def residual(self, q: Array) -> tuple[float, Array]:
         """Return by how much q is off the manifold [m, or 1], and the derivative of that, shape (n,)."""
         position, rotation, J = self._tip.at(q)

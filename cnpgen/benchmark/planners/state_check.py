@@ -1,0 +1,125 @@
+"""Which states a tree of motions may contain, and where the tip is there: many states at once, by a kernel."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.planners.boxes import CORNERS
+from cnpgen.benchmark.planners.cbirrt import APART, DEEP
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import choose_backend, problem_kernels
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
+from cnpgen.symbolic.linalg import Scalar, dot
+from cnpgen.symbolic.state import SymbolicState, Vec, symbols
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+UPRIGHT = 0.05  # of 1 - R_22: how far an object may tilt
+TABLE = 0.01  # m: how far from its height the tip may be
+
+
+class StateCheck:
+    """Checks states of one boundary problem: limits of joints and torques, the manifold, the surroundings.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+
+    Raises:
+        UsageError: There is neither a table nor a held object.
+    """
+
+    def __init__(self, problem: Problem, robot: "Robot") -> None:
+        if problem.object_size is None and table_of(problem) is None:
+            raise UsageError(f"it plans hits on a table and transports, and {problem.name!r} has neither")
+        self._problem, self._robot = problem, robot
+        self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_excess)
+
+    def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
+        """Return the heights of the obstacles' upper faces [m], shape (obstacles,), from the ends of a motion."""
+        return obstacle_tops(self._problem, start_xyz, goal_xyz)
+
+    def __call__(self, q: Array, dq: Array, ddq: Array, tops: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Look at N states.
+
+        Args:
+            q: Joint positions [rad], shape (N, n).
+            dq: Joint velocities [rad/s], shape (N, n).
+            ddq: Joint accelerations [rad/s^2], shape (N, n).
+            tops: What ``tops`` returned.
+
+        Returns:
+            Where the tip is [m], shape (N, 3), and whether the state is allowed, shape (N,).
+        """
+        lanes = [np.ascontiguousarray(values.T) for values in (q, dq, ddq)]
+        tip, excess = self._kernel(*lanes, np.ascontiguousarray(np.broadcast_to(tops[:, None], (len(tops), len(q)))))
+        return np.ascontiguousarray(tip.T), excess[0] <= 0
+
+    def random_place(self, tops: Array, random: np.random.Generator) -> Array:
+        """Draw a place: where a random configuration has the tip [m], shape (3,)."""
+        q = random.uniform(self._robot.position_lower, self._robot.position_upper)[None]
+        still = np.zeros_like(q)
+        return np.asarray(self(q, still, still, tops)[0][0])
+
+
+def table_of(problem: Problem) -> Table | None:
+    """Return the table of a problem; None if it has none."""
+    return next((each for each in problem.constraint if isinstance(each, Table)), None)
+
+
+def tip_and_excess(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, dq, ddq, tops) -> (tip, excess)``: by how much the worst bound is exceeded, in its own unit."""
+    import casadi as ca
+
+    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", len(problem.obstacle)))
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops) = (symbols(name, width) for name, width in names)
+    state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, problem.object_size)
+    tip, table = state.kinematics.tip, table_of(problem)
+    excess = [ca.fabs(value) - limit for value, limit in zip(dq, robot.velocity_limit.tolist(), strict=True)]
+    excess += [ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)]
+    excess += [low - value for value, low in zip(q, robot.position_lower.tolist(), strict=True)]
+    excess += [value - high for value, high in zip(q, robot.position_upper.tolist(), strict=True)]
+    excess += _off_the_table(table, tip) if table is not None else _off_the_way(state, tops)
+    worst: Scalar = excess[0]
+    for each in excess[1:]:
+        worst = ca.fmax(worst, each)
+    return ca.Function("tip_and_excess", [q_sx, dq_sx, ddq_sx, tops_sx], [ca.vertcat(*tip), worst])
+
+
+def _off_the_table(table: Table, tip: Vec) -> list[Scalar]:
+    import casadi as ca
+
+    sides = [
+        side
+        for place, span in zip(tip, (table.x, table.y), strict=False)
+        for side in (span.low - place, place - span.high)
+    ]
+    return [ca.fabs(tip[2] - table.z) - TABLE, *sides]
+
+
+def _off_the_way(state: SymbolicState, tops: Vec) -> list[Scalar]:
+    """Tilt of the object, its centre near a pedestal, and a corner in one, which reaches down without end."""
+    import casadi as ca
+
+    rotation, tip = state.kinematics.rotation, state.kinematics.tip
+    corners = [
+        [place + dot(row, corner) for place, row in zip(tip, rotation, strict=True)]
+        for corner in (CORNERS * np.array(state.object_size)).tolist()
+    ]
+    excess: list[Scalar] = [1.0 - rotation[2][2] - UPRIGHT]
+    for box, top in zip(state.obstacles, tops, strict=True):
+        sides = ((box.x.low, box.x.high), (box.y.low, box.y.high), (-np.inf, top))
+        outside = [
+            ca.fmax(ca.fmax(low - place, place - high), 0) for place, (low, high) in zip(tip, sides, strict=True)
+        ]
+        excess.append(APART - ca.sqrt(dot(outside, outside)))
+        for corner in corners:
+            rooms = [ca.fmin(place - low, high - place) for place, (low, high) in zip(corner, sides, strict=True)]
+            excess.append(ca.fmin(ca.fmin(rooms[0], rooms[1]), rooms[2]) - DEEP)
+    return excess
