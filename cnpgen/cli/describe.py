@@ -26,6 +26,7 @@ LIMITS = {
     "position_upper": "rad",
     "velocity_limit": "rad/s",
     "acceleration_limit": "rad/s^2",
+    "jerk_limit": "rad/s^3",
     "torque_limit": "N m",
 }
 
@@ -89,6 +90,7 @@ def describe_problem(problem: Problem) -> str:
             "",
             "  planning limits",
             *table(_limit_rows(robot), indent="    "),
+            *([_jerk_limits(robot)] if problem.uses_jerk else []),
             *_shape(robot),
             "",
             "  constraints",
@@ -122,6 +124,10 @@ def _limit_rows(robot: Robot) -> list[tuple[str, ...]]:
         head,
         *((name, f"{low:.4g} to {high:.4g}", *(f"{x:.4g}" for x in rest)) for name, (low, high), *rest in rows),
     ]
+
+
+def _jerk_limits(robot: Robot) -> str:
+    return f"    jerk [rad/s^3], joint by joint: {', '.join(f'{x:.4g}' for x in robot.jerk_limit)}"
 
 
 def _title(title: str) -> list[str]:

@@ -13,15 +13,23 @@ from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState
+from cnpgen.symbolic.state import SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-ARGUMENTS: tuple[Axes, ...] = ("point", "point", "point", "point", "lane", "point", "node", "fixed", "fixed")
-WIDER = 5  # which of them is the funnel
-VALUES = GridSpec(ARGUMENTS, ("lane",))
-GRADIENT = GridSpec(ARGUMENTS, ("lane", "point", "point", "point", "point"))
+
+def grid_specs(problem: Problem) -> tuple[GridSpec, GridSpec]:
+    """Say what the arguments and results of ``loss_values`` and ``loss_gradient`` vary over."""
+    point: Axes = "point"
+    splines = (point,) * (problem.path_orders + 1)
+    arguments: tuple[Axes, ...] = (*splines, "lane", "point", "node", "fixed", "fixed")
+    return GridSpec(arguments, ("lane",)), GridSpec(arguments, ("lane", *splines))
+
+
+def wider_argument(problem: Problem) -> int:
+    """Say which argument of the kernels is the funnel."""
+    return problem.path_orders + 2
 
 
 @dataclass(frozen=True)
@@ -45,13 +53,11 @@ class HeldState(SymbolicState):
 
 @dataclass(frozen=True)
 class Inputs:
-    """The arguments of the kernels as SX columns, in order; ``ARGUMENTS`` says what they vary over.
+    """The arguments of the kernels as SX columns, in order; ``grid_specs`` says what they vary over.
 
     Attributes:
-        p: Path [rad], n.
-        dp: p' [rad].
-        ddp: p'' [rad].
-        rate: r and r' [1/s].
+        path: p, p' and p'' [rad], n each; p''', too, where the jerk is constrained.
+        rate: r and r' [1/s], and r'' where the jerk is constrained.
         tops: Heights of the obstacles [m].
         wider: How much wider than their bounds the conditions of constraints with a funnel are, in their units.
         node: The quadrature weight.
@@ -59,9 +65,7 @@ class Inputs:
         weights: The weight of every constraint (the paper's e^alpha).
     """
 
-    p: Any
-    dp: Any
-    ddp: Any
+    path: tuple[Any, ...]
     rate: Any
     tops: Any
     wider: Any
@@ -72,7 +76,7 @@ class Inputs:
     @property
     def columns(self) -> list[Any]:
         """All of them."""
-        return [*vars(self).values()]
+        return [*self.path, *(column for name, column in vars(self).items() if name != "path")]
 
 
 def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
@@ -84,19 +88,19 @@ def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
 
 
 def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
-    """Build ``inputs -> (terms, d/dp, d/dp', d/dp'', d/d(r, r'))`` of the weighted sum, by the reverse mode."""
+    """Build ``inputs -> (terms, d/dp, d/dp', ..., d/d(r, r', ...))`` of the weighted sum, by the reverse mode."""
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
     n, step, weights = robot.n, inputs.node / inputs.rate[0], [1.0, *ca.vertsplit(inputs.weights)]
     g = [part for term in terms for part, _ in term.parts]
     seeds = [step * weight * slope for weight, term in zip(weights, terms, strict=True) for _, slope in term.parts]
-    states = ca.vertcat(inputs.p, inputs.dp, inputs.ddp, inputs.rate)
+    states, width = ca.vertcat(*inputs.path, inputs.rate), len(inputs.path) * n
     back = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
     total = sum(weight * term.value for weight, term in zip(weights, terms, strict=True))
-    back[3 * n] -= step / inputs.rate[0] * total  # the factor 1 / r
-    parts = [back[first : first + n] for first in (0, n, 2 * n)]
-    results = _released(state, [_stacked(inputs, terms), *parts, back[3 * n :]])
+    back[width] -= step / inputs.rate[0] * total  # the factor 1 / r
+    parts = [back[first : first + n] for first in range(0, width, n)]
+    results = _released(state, [_stacked(inputs, terms), *parts, back[width:]])
     return ca.Function("loss_gradient", inputs.columns, ca.cse(results))
 
 
@@ -117,15 +121,18 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldSta
     import casadi as ca
 
     sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
-    p, dp, ddp, rate = sym("p", n), sym("dp", n), sym("ddp", n), sym("rate", 2)
+    orders = problem.path_orders
+    p, dp, ddp, *_ = path = tuple(sym("d" * order + "p", n) for order in range(orders))
+    rate = sym("rate", orders - 1)
     dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
     tops, size = sym("tops", len(problem.obstacle)), problem.object_size
     q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
-    state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size)
+    jerk = jerk_along([ca.vertsplit(column) for column in path[1:]], ca.vertsplit(rate))
+    state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size, jerk)
     pairs = stated(problem.constraint, state, form)
     count = sum(len(condition.g) for each, conditions in pairs if has_funnel(each) for condition in conditions)
     wider, tightening = sym("wider", count), sym("tightening", 2 * m)
-    inputs = Inputs(p, dp, ddp, rate, tops, wider, sym("node"), tightening, sym("weights", m))
+    inputs = Inputs(path, rate, tops, wider, sym("node"), tightening, sym("weights", m))
     free = iter(ca.vertsplit(wider))
     terms = [task_term(state, problem.objective.centrifugal)]
     for index, (each, conditions) in enumerate(pairs):

@@ -53,7 +53,13 @@ class Margins:
 
 
 # A penalty leaves violations of the order of 1 / weight, and a network errs by a percent here and there.
-FACTORS = {"joint-position": 0.999, "joint-velocity": 0.99, "joint-acceleration": 0.985, "joint-torque": 0.97}
+FACTORS = {
+    "joint-position": 0.999,
+    "joint-velocity": 0.99,
+    "joint-acceleration": 0.985,
+    "joint-jerk": 0.97,
+    "joint-torque": 0.97,
+}
 INSETS = {"table": 1e-3, "object-contact": 5e-4}  # m
 
 

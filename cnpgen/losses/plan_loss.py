@@ -14,7 +14,7 @@ from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
 from cnpgen.losses.funnel import Funnel, make_funnel
-from cnpgen.losses.integrand import GRADIENT, VALUES, WIDER, loss_gradient, loss_values
+from cnpgen.losses.integrand import grid_specs, loss_gradient, loss_values, wider_argument
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_batch import BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
@@ -138,7 +138,8 @@ class PlanLoss:
         gradient, shift = flag("gradient", gradient), number("shift", shift)
         batch = check_batch(self.problem, path, rate, tops, start_tip, dtype=self.dtype)
         scales = self.checked_weights(weights)
-        table = basis_table(self.problem.trajectory, self.rule, self.nodes, shift, self.dtype)
+        orders = self.problem.path_orders
+        table = basis_table(self.problem.trajectory, self.rule, self.nodes, shift, self.dtype, orders=orders)
         n, wanted = len(batch), slice(None) if gradient else slice(0)
         terms = np.empty((n, len(self.terms)), self.dtype)
         path_gradient, rate_gradient = np.empty_like(batch.path[wanted]), np.empty_like(batch.rate[wanted])
@@ -158,11 +159,11 @@ class PlanLoss:
         self, batch: PlanBatch, weights: Array, table: BasisTable, *, gradient: bool
     ) -> tuple[Array, Array, Array]:
         """Return terms and gradients of a block, samples last; those of no plan if they are not wanted."""
-        nodes, (points, n) = len(table.s), batch.path.shape[1:]
+        nodes, orders, (points, n) = len(table.s), self.problem.path_orders, batch.path.shape[1:]
         rates = batch.lanes(batch.rate)
         lanes = rates.shape[1]
-        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(3, nodes, n, lanes)
-        rate = (table.rate @ rates).reshape(2, nodes, lanes)
+        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(orders, nodes, n, lanes)
+        rate = (table.rate @ rates).reshape(orders - 1, nodes, lanes)
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
             *path.swapaxes(1, 2), rate, batch.lanes(batch.tops), self._wider(batch, table, lanes, gradient=gradient),
@@ -173,13 +174,13 @@ class PlanLoss:
             return terms, np.empty((points, n, 0), self.dtype), np.empty((len(batch.rate[0]), 0), self.dtype)
         by_path, by_rate = np.empty_like(path), np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
-        back = table.path.T @ by_path.reshape(3 * nodes, -1)
-        return terms, back.reshape(points, n, lanes), table.rate.T @ by_rate.reshape(2 * nodes, -1)
+        back = table.path.T @ by_path.reshape(orders * nodes, -1)
+        return terms, back.reshape(points, n, lanes), table.rate.T @ by_rate.reshape((orders - 1) * nodes, -1)
 
     def _wider(self, batch: PlanBatch, table: BasisTable, lanes: int, *, gradient: bool) -> Array:
         """How much wider than their bounds the conditions with a funnel are, shape (values, K, lanes)."""
         kernel = self._gradient if gradient else self._values
-        out = np.zeros((kernel.tape.inputs[WIDER], len(table.s), lanes), self.dtype)
+        out = np.zeros((kernel.tape.inputs[wider_argument(self.problem)], len(table.s), lanes), self.dtype)
         if batch.start_tip is not None and len(out):
             out[..., : len(batch)] = self._funnel.width(table.s, batch.start_tip)
         return out
@@ -232,11 +233,11 @@ class PlanLoss:
 
     @cached_property
     def _gradient(self) -> GridKernel:
-        return self._kernels.load_grid(loss_gradient, GRADIENT, dtype=self.dtype, form=self.form)
+        return self._kernels.load_grid(loss_gradient, grid_specs(self.problem)[1], dtype=self.dtype, form=self.form)
 
     @cached_property
     def _values(self) -> GridKernel:
-        return self._kernels.load_grid(loss_values, VALUES, dtype=self.dtype, form=self.form)
+        return self._kernels.load_grid(loss_values, grid_specs(self.problem)[0], dtype=self.dtype, form=self.form)
 
     @cached_property
     def _funnel(self) -> Funnel:

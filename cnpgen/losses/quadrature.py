@@ -74,8 +74,8 @@ class BasisTable:
     Attributes:
         s: Phases, shape (K,), float64.
         weights: Quadrature weights, shape (1, K).
-        path: Those of p, p' and p'', shape (3 K, C).
-        rate: Those of r and r', shape (2 K, R).
+        path: Those of p and its derivatives, shape (orders K, C).
+        rate: Those of r and its derivatives, shape ((orders - 1) K, R).
     """
 
     s: Array
@@ -85,9 +85,11 @@ class BasisTable:
 
 
 @lru_cache(maxsize=64)
-def basis_table(spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str) -> BasisTable:
-    """Tabulate the basis of both splines at the nodes of ``quadrature``."""
+def basis_table(
+    spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str, *, orders: int = 3
+) -> BasisTable:
+    """Tabulate the basis of both splines at the nodes of ``quadrature``, with so many orders of p."""
     s, weights = quadrature(rule, nodes, shift)
-    path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(3)]
-    rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)]
+    path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
+    rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]
     return BasisTable(s, weights[None].astype(dtype), np.vstack(path).astype(dtype), np.vstack(rate).astype(dtype))

@@ -11,7 +11,7 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState, Vec, symbols
+from cnpgen.symbolic.state import SymbolicState, Vec, jerk_along, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -26,7 +26,7 @@ def equality_residuals(robot: "Robot", problem: Problem) -> Any:
     (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
     rows = [
         value - float(wanted)
-        for condition, needs in _conditions(robot, problem, _moving(robot, q), tops)
+        for condition, needs in _conditions(robot, problem, _moving(problem, q), tops)
         if needs == 0 and condition.is_equality
         for value, wanted in zip(condition.g, condition.lower, strict=True)
     ]
@@ -36,30 +36,38 @@ def equality_residuals(robot: "Robot", problem: Problem) -> Any:
 
 
 def speed_residuals(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(q, dq, ddq, tops) -> g``: every value bounded by the problem that depends on how fast a path is run."""
+    """Build ``(q, dq, ddq, tops) -> g``: every value bounded by the problem that depends on how fast a path is run.
+
+    With constraints of the jerk it is ``(q, dq, ddq, jerk, tops) -> g``.
+    """
     import casadi as ca
 
     (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
-    state = _moving(robot, q)
+    state = _moving(problem, q)
     rows = [value for condition, needs in _conditions(robot, problem, state, tops) if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
-    return ca.Function("speed_residuals", [q_sx, state.of_dq, state.of_ddq, tops_sx], [g])
+    return ca.Function("speed_residuals", [q_sx, *state.moving, tops_sx], [g])
 
 
 def speed_excess(robot: "Robot", problem: Problem) -> Any:
     """Build ``(p, p', p'', r, r', tops, in one column) -> e``: by how much the worst of ``speed_residuals`` is out.
+
+    With constraints of the jerk the column has p''' after p'' and r'' after r'.
 
     Negative if all are within their bounds. The column is one argument because a first look at one plan takes no longer
     than handing over five.
     """
     import casadi as ca
 
-    n, names = robot.n, ("p", "p1", "p2", "rates", "tops")
-    widths = (n, n, n, 2, len(problem.obstacle))
-    columns, (p, p1, p2, (r, r1), tops) = zip(*map(symbols, names, widths), strict=True)
+    orders = problem.path_orders
+    names = (*(f"p{order}" for order in range(orders)), "rates", "tops")
+    widths = (*[robot.n] * orders, orders - 1, len(problem.obstacle))
+    columns, (p, *path, rate, tops) = zip(*map(symbols, names, widths), strict=True)
+    (p1, p2), (r, r1) = path[:2], rate[:2]
     dq = [slope * r for slope in p1]
     ddq = [(curve * r + slope * r1) * r for curve, slope in zip(p2, p1, strict=True)]
-    state = _State(p, dq, ddq, of_dq=ca.vertcat(columns[1], r), of_ddq=ca.vertcat(columns[2], r1))
+    moving = tuple(ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders))
+    state = _State(p, dq, ddq, jerk_along(path, rate), moving)
     out: list[Any] = []
     for condition, needs in _conditions(robot, problem, state, tops):
         if needs:
@@ -75,39 +83,41 @@ def has_equalities(kernels: KernelLibrary) -> bool:
     return kernels.tape(equality_residuals).outputs[0] > 0
 
 
-def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array]:
-    """Bounds of the rows of ``speed_residuals``: lower and upper, shape (m,) each."""
-    found = [condition for condition, needs in _any_conditions(robot, problem) if needs]
+def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Lower and upper bounds of the rows of ``speed_residuals``, and which depend on the jerk, shape (m,) each."""
+    found = [(condition, needs == 3) for condition, needs in _any_conditions(robot, problem) if needs]
     return (
-        np.concatenate([condition.lower for condition in found] or [np.empty(0)]),
-        np.concatenate([condition.upper for condition in found] or [np.empty(0)]),
+        np.concatenate([condition.lower for condition, _ in found] or [np.empty(0)]),
+        np.concatenate([condition.upper for condition, _ in found] or [np.empty(0)]),
+        np.array([cubic for condition, cubic in found for _ in condition.g], bool),
     )
 
 
 @dataclass(frozen=True)
 class _State:
-    """A state (q, dq, ddq), the symbols that its velocities are made of, and those of its accelerations alone."""
+    """A state, its jerk where it is constrained, and the symbols that every derivative has and no lower one."""
 
     q: Vec
     dq: Vec
     ddq: Vec
-    of_dq: Any
-    of_ddq: Any
+    jerk: Vec | None
+    moving: tuple[Any, ...]
 
 
-def _moving(robot: "Robot", q: Vec) -> _State:
-    (dq_sx, dq), (ddq_sx, ddq) = symbols("dq", robot.n), symbols("ddq", robot.n)
-    return _State(q, dq, ddq, dq_sx, ddq_sx)
+def _moving(problem: Problem, q: Vec) -> _State:
+    names = ("dq", "ddq", "jerk")[: problem.path_orders - 1]
+    columns, (dq, ddq, *third) = zip(*(symbols(name, len(q)) for name in names), strict=True)
+    return _State(q, dq, ddq, third[0] if third else None, columns)
 
 
 def _any_conditions(robot: "Robot", problem: Problem) -> list[tuple[Condition, int]]:
     tops = symbols("tops", len(problem.obstacle))[1]
-    return _conditions(robot, problem, _moving(robot, symbols("q", robot.n)[1]), tops)
+    return _conditions(robot, problem, _moving(problem, symbols("q", robot.n)[1]), tops)
 
 
 def _conditions(robot: "Robot", problem: Problem, state: _State, tops: Vec) -> list[tuple[Condition, int]]:
     """State all constraints at a state, each with the highest derivative of q that it depends on."""
     size = problem.object_size
-    symbolic = SymbolicState(robot, state.q, state.dq, state.ddq, tops, problem.obstacle, size)
+    symbolic = SymbolicState(robot, state.q, state.dq, state.ddq, tops, problem.obstacle, size, state.jerk)
     found = [condition for constraint in problem.constraint for condition in constraint.symbolic(symbolic)]
-    return [(condition, symbolic_needs(condition, state.of_dq, state.of_ddq)) for condition in found]
+    return [(condition, symbolic_needs(condition, *state.moving)) for condition in found]

@@ -2,7 +2,8 @@
 
 At ``r / k`` velocities are 1/k and accelerations 1/k^2 of what they were. A bounded value g(q, dq, ddq) is then
 ``g0 + b / k + c / k^2``, exactly so for velocities, accelerations and torques; g at k = 1, at k = 2 and at rest gives
-b and c, and the smallest k at which every g is within its bounds follows in closed form.
+b and c, and the smallest k at which every g is within its bounds follows in closed form. What depends on the jerk
+is ``g0 + d / k^3``.
 """
 
 from dataclasses import dataclass
@@ -38,14 +39,16 @@ class Slowing:
         residuals: Kernel of ``expressions.speed_residuals``.
         lower: Lower bounds of its values, shape (m,).
         upper: Upper bounds, shape (m,).
-        path: Basis of p, p' and p'' at K phases, shape (3, K, C).
-        rate: Basis of r and r', shape (2, K, R).
+        cubic: Which of the values depend on the jerk, shape (m,).
+        path: Basis of p and its derivatives at K phases, shape (orders, K, C).
+        rate: Basis of r and its derivatives, shape (orders - 1, K, R).
     """
 
     excess: Kernel
     residuals: Kernel
     lower: Array
     upper: Array
+    cubic: NDArray[np.bool_]
     path: Array
     rate: Array
 
@@ -71,28 +74,33 @@ class Slowing:
         return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
 
     def _column(self, motion: Motion, tops: Array) -> Array:
-        """Lay out p, p', p'', r, r' and obstacles at all phases of N motions, shape (3 n + 2 + obstacles, N K)."""
-        (_, phases, points), (count, _, n) = self.path.shape, motion.path.shape
-        out = np.empty((3 * n + 2 + tops.shape[1], count * phases))
+        """Lay out p, p', ..., r, r', ... and obstacles at all phases of N motions, shape (width, N K)."""
+        (orders, phases, points), (count, _, n) = self.path.shape, motion.path.shape
+        first, last = orders * n, orders * n + orders - 1
+        out = np.empty((last + tops.shape[1], count * phases))
         path = motion.path.transpose(2, 0, 1).reshape(n * count, points)
-        np.matmul(path, self.path.swapaxes(1, 2), out=out[: 3 * n].reshape(3, n * count, phases))
-        np.matmul(motion.rate, self.rate.swapaxes(1, 2), out=out[3 * n : 3 * n + 2].reshape(2, count, phases))
-        out[3 * n + 2 :].reshape(-1, count, phases)[:] = tops.T[..., None]
+        np.matmul(path, self.path.swapaxes(1, 2), out=out[:first].reshape(orders, n * count, phases))
+        np.matmul(motion.rate, self.rate.swapaxes(1, 2), out=out[first:last].reshape(orders - 1, count, phases))
+        out[last:].reshape(-1, count, phases)[:] = tops.T[..., None]
         return out
 
     def _needed(self, column: Array) -> Array:
         """Smallest factors that L of the columns of ``_column`` ask for, shape (L,)."""
-        n = self.residuals.tape.inputs[0]
-        p, p1, p2 = column[:n], column[n : 2 * n], column[2 * n : 3 * n]
-        (r, r1), tops = column[3 * n : 3 * n + 2], column[3 * n + 2 :]
-        dq, ddq = p1 * r, (p2 * r + p1 * r1) * r
-        fast, slow, rest = (self.residuals(p, dq / k, ddq / k**2, tops)[0] for k in (1.0, 2.0, np.inf))
+        n, orders = self.residuals.tape.inputs[0], len(self.path)
+        p, p1, p2, *third = column[: orders * n].reshape(orders, n, -1)
+        (r, r1, *second), tops = column[orders * n :][: orders - 1], column[orders * n + orders - 1 :]
+        moving = [p1 * r, (p2 * r + p1 * r1) * r]
+        moving += [((third[0] * r + 3 * p2 * r1) * r + p1 * (second[0] * r + r1**2)) * r] if third else []
+        fast, slow, rest = (
+            self.residuals(p, *(each / k**order for order, each in enumerate(moving, 1)), tops)[0]
+            for k in (1.0, 2.0, np.inf)
+        )
         quadratic = 2 * (fast - 2 * slow + rest)  # c, from g(1) = rest + b + c and g(2) = rest + b / 2 + c / 4
         linear = fast - rest - quadratic
-        needed = np.maximum(
-            _smallest(self.upper[:, None] - rest, linear, quadratic),
-            _smallest(rest - self.lower[:, None], -linear, -quadratic),
-        )
+        above, below = self.upper[:, None] - rest, rest - self.lower[:, None]
+        needed = np.maximum(_smallest(above, linear, quadratic), _smallest(below, -linear, -quadratic))
+        change, cubic = (fast - rest)[self.cubic], self.cubic
+        needed[cubic] = np.maximum(_smallest_cubic(above[cubic], change), _smallest_cubic(below[cubic], -change))
         return np.asarray(needed.max(axis=0, initial=1.0))
 
 
@@ -104,11 +112,11 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
         robot: Its robot.
         kernels: Where kernels are loaded from.
     """
-    spec, s = problem.trajectory, chebyshev(PHASES)
-    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(3)])
-    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)])
+    spec, s, orders = problem.trajectory, chebyshev(PHASES), problem.path_orders
+    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)])
+    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)])
     excess, residuals = kernels.load(speed_excess), kernels.load(speed_residuals)
-    return Slowing(excess, residuals, *speed_bounds(robot, problem), path, rate)
+    return Slowing(excess, residuals, *speed_bounds(robot, problem), path=path, rate=rate)
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:
@@ -118,3 +126,10 @@ def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:
         k = (linear + root) / (2 * room)  # of room k^2 - linear k - quadratic = 0
     broken = (linear + quadratic > room) & (room > 0) & np.isfinite(k)
     return np.where(broken, np.maximum(k, 1.0), 1.0)
+
+
+def _smallest_cubic(room: Array, change: Array) -> Array:
+    """Smallest k >= 1 with ``change / k^3 <= room``, elementwise; 1 where there is no room at rest."""
+    with np.errstate(all="ignore"):
+        k = np.cbrt(change / room)
+    return np.where((change > room) & (room > 0) & np.isfinite(k), k, 1.0)

@@ -8,6 +8,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError, nearest
+from cnpgen.robots.shape.files import find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
 from cnpgen.schema.units import show
@@ -32,7 +33,11 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
     urdf, joints, tip = robot.get("urdf"), robot.get("joints"), robot.get("tip")
     if not isinstance(urdf, str):
         return
-    path = folder / urdf
+    try:
+        path = find_urdf(urdf, folder / "problem.toml", named_packages(robot, folder))
+    except RecipeError as error:
+        yield (where / "urdf").says(str(error))
+        return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
         yield (where / "urdf").says(f"no such file: {path}{hint}")
@@ -56,6 +61,12 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
     for name, low, high in _locked_outside(tree.iter("joint"), joints if isinstance(joints, list) else []):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
         yield (where / "joints").says(text)
+
+
+def named_packages(robot: dict[str, Any], folder: Path) -> list[Path]:
+    """List the folders that ``packages`` in the table [robot] of a problem in ``folder`` names."""
+    named = robot.get("packages", [])
+    return [folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
 
 
 def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -> Iterator[tuple[str, float, float]]:

@@ -6,8 +6,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.checks import tables
-from cnpgen.robots.shape.files import find_named_file
+from cnpgen.problems.checks import named_packages, tables
+from cnpgen.robots.shape.files import find_named_file, find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
 
@@ -60,15 +60,14 @@ def _missing_files(
     table: dict[str, Any], where: Place, folder: Path, elements: list[ElementTree.Element]
 ) -> Iterator[str]:
     robot = _robot(table)
-    named = robot.get("packages", [])
-    packages = [folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
+    packages = named_packages(robot, folder)
     for package in packages:
         if not package.is_dir():
             yield (where / "packages").says(f"no such folder: {package}")
     meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
     for name in meshes:
         try:
-            find_named_file(name, folder / str(robot["urdf"]), packages)
+            find_named_file(name, find_urdf(str(robot["urdf"]), folder / "problem.toml", packages), packages)
         except RecipeError as error:
             yield (where / "urdf").says(str(error))
     srdf = robot.get("srdf")
@@ -82,7 +81,8 @@ def _collision_elements(table: dict[str, Any], folder: Path) -> list[ElementTree
     if not isinstance(urdf, str):
         return []
     try:
-        tree = urdf_tree(read_urdf(folder / urdf))
+        path = find_urdf(urdf, folder / "problem.toml", named_packages(_robot(table), folder))
+        tree = urdf_tree(read_urdf(path))
     except (RecipeError, ValueError):
         return []
     return list(tree.iterfind("link/collision"))

@@ -11,6 +11,7 @@ from typing import Any
 
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.robots.shape.files import find_urdf
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.srdf import with_disabled_pairs
 from cnpgen.robots.spec import HeldObject, LimitSpec, Obstacle, Payload, RobotSpec
@@ -68,9 +69,27 @@ class Problem:
         return None if self.object is None else self.object.size
 
     @property
+    def uses_jerk(self) -> bool:
+        """Whether a constraint is about jerks."""
+        return any(constraint.uses_jerk for constraint in self.constraint)
+
+    @property
+    def path_orders(self) -> int:
+        """How many derivatives of p(s), itself included, its constraints depend on; of r(s) they are one less."""
+        return 4 if self.uses_jerk else 3
+
+    @property
     def urdf_path(self) -> Path:
-        """The URDF file."""
-        return self.path.parent / self.robot.urdf
+        """The URDF file.
+
+        Raises:
+            RecipeError: It is one of a package that is not there.
+        """
+        return find_urdf(self.robot.urdf, self.path, self._packages)
+
+    @property
+    def _packages(self) -> list[Path]:
+        return [self.path.parent / each for each in self.robot.packages]
 
     @cached_property
     def urdf_text(self) -> str:
@@ -81,11 +100,11 @@ class Problem:
         Raises:
             RecipeError: The file cannot be read, or is not UTF-8; or a mesh or the SRDF.
         """
-        text, folder, spec = read_urdf(self.urdf_path), self.path.parent, self.robot
+        text, spec = read_urdf(self.urdf_path), self.robot
         if spec.geometry != "urdf":
             return text
-        text = with_inline_meshes(text, self.urdf_path, [folder / each for each in spec.packages])
-        return with_disabled_pairs(text, folder / spec.srdf) if spec.srdf else text
+        text = with_inline_meshes(text, self.urdf_path, self._packages)
+        return with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
 
     @cached_property
     def identity(self) -> str:

@@ -20,6 +20,8 @@ from cnpgen.schema.keys import PerJoint
 
 Array = NDArray[np.float64]
 
+JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
+
 
 def load_robot(problem: Problem) -> Robot:
     """Load the robot of a problem.
@@ -37,6 +39,7 @@ def load_robot(problem: Problem) -> Robot:
         velocity = limits.velocity_scale * rated
         most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
         acceleration = _given(limits.acceleration, "acceleration", most)
+        jerk = _given(limits.jerk, "jerk", JERK_RATE * acceleration)
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
     middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
@@ -51,6 +54,7 @@ def load_robot(problem: Problem) -> Robot:
         position_upper=middle + half,
         velocity_limit=velocity,
         acceleration_limit=acceleration,
+        jerk_limit=jerk,
         torque_limit=limits.torque_scale * torque,
         rated_velocity=rated,
         base=np.array(spec.base),

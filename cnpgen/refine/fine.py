@@ -30,8 +30,8 @@ class Excess:
     Attributes:
         worst: The largest excess as a multiple of what is allowed; inf where something is not finite.
         position: Whether a condition on q alone is exceeded by more than allowed.
-        slower: By which factor the motion must be slowed down for the worst velocity, acceleration and torque, if
-            those scaled with the rate and its square; at least 1.
+        slower: By which factor the motion must be slowed down for the worst velocity, acceleration, torque and jerk, if
+            those scaled with the rate, its square and its cube; at least 1.
     """
 
     worst: float
@@ -52,7 +52,7 @@ class FineCheck:
     """
 
     def __init__(self, problem: Problem, world: "World", stage: ResidualKernels) -> None:
-        self._grid = make_grid(stage.spec, POINTS)
+        self._grid = make_grid(stage.spec, POINTS, problem.path_orders)
         self._last = of_last(lambda task: Transcription(stage, self._grid, boundary=task.boundary, tops=task.tops))
         none = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
         self._bounds = BoundsTemplate(problem, world, self._grid.s, none)
@@ -77,8 +77,9 @@ class FineCheck:
         high = ratio > 1
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.where(high, g / np.where(g > bounds.upper, bounds.upper, bounds.lower), 0.0).max(axis=0)
-        speed, strength = (size[self._bounds.needs == needs].max(initial=1.0) for needs in (1, 2))
-        return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), max(speed, float(np.sqrt(strength))))
+        speed, strength, jerk = (size[self._bounds.needs == needs].max(initial=1.0) for needs in (1, 2, 3))
+        slower = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
+        return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), slower)
 
     def refutes_ends(self, task: Task) -> bool:
         """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
@@ -95,7 +96,7 @@ class FineCheck:
     def slow_down(
         self, task: Task, motion: Transcription, x: Array, *, at_any_cost: bool = False
     ) -> tuple[Array, float, Excess]:
-        """Slow a motion from rest to rest down uniformly until velocities, accelerations and torques are met.
+        """Slow a motion from rest to rest down uniformly until all limits that it helps against are met.
 
         Its path stays, its rate is divided by one factor. That cures no position and no torque against gravity: where
         these are broken, too, nothing is done, unless it is asked for at any cost.

@@ -117,7 +117,8 @@ class Refiner:
         )
         self.passes = default_passes(problem, settings) if passes is None else passes
         self.check = FineCheck(problem, world, self.stage)
-        self._grids = {points: make_grid(self.spec, points) for points in {each.points for each in self._every}}
+        orders = problem.path_orders
+        self._grids = {points: make_grid(self.spec, points, orders) for points in {each.points for each in self._every}}
         self._bounds = {
             each: BoundsTemplate(problem, world, self._grids[each.points].s, each.tightening) for each in self._every
         }

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
-
 
 @dataclass(frozen=True)
 class Robot:
@@ -38,6 +36,7 @@ class Robot:
         position_upper: Likewise, shape (n,).
         velocity_limit: Symmetric planning limit of joint velocities [rad/s], shape (n,).
         acceleration_limit: Symmetric planning limit of joint accelerations [rad/s^2], shape (n,).
+        jerk_limit: Symmetric planning limit of joint jerks [rad/s^3], shape (n,); only ``joint-jerk`` constrains them.
         torque_limit: Symmetric planning limit of joint torques [N m], shape (n,).
         rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
         base: Base configuration [rad], shape (n,).
@@ -54,6 +53,7 @@ class Robot:
     position_upper: Array
     velocity_limit: Array
     acceleration_limit: Array
+    jerk_limit: Array
     torque_limit: Array
     rated_velocity: Array
     base: Array
@@ -64,11 +64,6 @@ class Robot:
     def n(self) -> int:
         """Number of planned joints."""
         return len(self.joint_names)
-
-    @property
-    def jerk_limit(self) -> Array:
-        """What jerks are compared with [rad/s^3], shape (n,); the authors' figure: reported, not constrained."""
-        return JERK_RATE * self.acceleration_limit
 
     @cached_property
     def skeleton(self) -> tuple[tuple[int, int], ...]:

@@ -78,6 +78,13 @@ class LimitSpec:
         low=1e-6,
         late=True,
     )
+    jerk: PerJoint | None = field(
+        "planning limits of joint jerks; by default 5/s x those of the accelerations",
+        unit="rad/s^3",
+        default=None,
+        low=1e-6,
+        late=True,
+    )
     torque: PerJoint | None = field(
         "limits of joint torques in the place of the URDF's", unit="N m", default=None, low=1e-6, late=True
     )

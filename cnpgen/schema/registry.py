@@ -48,6 +48,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "joint-position": "cnpgen.problems.constraints.joint:JointPosition",
         "joint-velocity": "cnpgen.problems.constraints.joint:JointVelocity",
         "joint-acceleration": "cnpgen.problems.constraints.joint:JointAcceleration",
+        "joint-jerk": "cnpgen.problems.constraints.joint:JointJerk",
         "joint-torque": "cnpgen.problems.constraints.joint:JointTorque",
         "table": "cnpgen.problems.constraints.table:Table",
         "plane": "cnpgen.problems.constraints.plane:Plane",

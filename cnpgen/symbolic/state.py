@@ -4,6 +4,7 @@ All vectors are Python lists of SX scalars in the world frame unless said otherw
 nothing.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -200,6 +201,7 @@ class SymbolicState:
     tops: Vec
     obstacles: "tuple[Obstacle, ...]"
     object_size: tuple[float, float, float] | None
+    jerk: Vec | None = None
 
     @cached_property
     def kinematics(self) -> Kinematics:
@@ -273,6 +275,19 @@ class SymbolicState:
     def hold(self, value: Scalar) -> Scalar:
         """Return a value that the derivative of what it is used in may take as a constant; here nothing is held."""
         return value
+
+
+def jerk_along(path: Sequence[Vec], rate: Sequence[Scalar]) -> Vec | None:
+    """Return the jerk ``p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r``; None where p''' is not given.
+
+    Args:
+        path: p', p'' and p'''.
+        rate: r, r' and r''.
+    """
+    if len(path) < 3:
+        return None
+    (p1, p2, p3), (r, r1, r2) = path, rate
+    return [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in zip(p1, p2, p3, strict=True)]
 
 
 def symbols(name: str, width: int) -> tuple[Any, Vec]:

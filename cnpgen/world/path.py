@@ -40,6 +40,7 @@ class PathWorld:
         q: Joint positions [rad], shape (n, K).
         dq: Joint velocities [rad/s], shape (n, K).
         ddq: Joint accelerations [rad/s^2], shape (n, K).
+        jerk: Joint jerks [rad/s^3], shape (n, K); None where no constraint is about them.
         tip_position: Positions of the tip [m], shape (3, K).
         tip_rotation: Rotation matrices of the tip frame, shape (3, 3, K).
     """
@@ -65,7 +66,7 @@ class PathWorld:
         rest = np.zeros((robot.n, 1))
         self.set_path(robot.base[:, None], rest, rest, np.zeros(len(obstacles)))
 
-    def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array) -> None:
+    def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
         """Move to K states.
 
         Args:
@@ -73,8 +74,9 @@ class PathWorld:
             dq: Joint velocities [rad/s], shape (n, K).
             ddq: Joint accelerations [rad/s^2], shape (n, K).
             tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
+            jerk: Joint jerks [rad/s^3], shape (n, K), if they are wanted.
         """
-        self.q, self.dq, self.ddq = q, dq, ddq
+        self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
         self._placed = False
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None

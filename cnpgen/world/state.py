@@ -34,6 +34,7 @@ class World:
         q: Joint positions [rad], shape (n,).
         dq: Joint velocities [rad/s], shape (n,).
         ddq: Joint accelerations [rad/s^2], shape (n,).
+        jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state, and where no constraint is about them.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class World:
         zero = np.zeros(robot.n)
         self.set_state(robot.base, zero, zero, np.zeros(len(obstacles)))
 
-    def set_state(self, q: Array, dq: Array, ddq: Array, tops: Array) -> None:
+    def set_state(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
         """Move to a state.
 
         Args:
@@ -63,10 +64,11 @@ class World:
             dq: Joint velocities [rad/s], shape (n,).
             ddq: Joint accelerations [rad/s^2], shape (n,).
             tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
+            jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
         """
         import pinocchio as pin
 
-        self.q, self.dq, self.ddq = q, dq, ddq
+        self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
         self._scene.set_tops(tops.tolist())

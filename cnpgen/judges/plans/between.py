@@ -1,8 +1,9 @@
-"""The largest value of a joint's position, velocity and acceleration over a whole motion, between any two moments.
+"""The largest value of a joint's position, velocity, acceleration and jerk over a motion, between any two moments.
 
-Between knots they are polynomials in s: q of degree D, dq = p' r of degree 2 D - 1 and ddq = (p'' r + p' r') r of
-degree 3 D - 2. A polynomial in Bernstein form lies between its least and its largest coefficient, and halving its
-interval brings those closer by a factor of four: halving wherever the largest value could still be proves where it is.
+Between knots they are polynomials in s: q of degree D, dq = p' r of degree 2 D - 1, ddq = (p'' r + p' r') r of degree
+3 D - 2 and jerk = ((p''' r + 3 p'' r') r + p' (r'' r + r'^2)) r of degree 4 D - 3. A polynomial in Bernstein form lies
+between its least and its largest coefficient, and halving its interval brings those closer by a factor of four: halving
+wherever the largest value could still be proves where it is.
 """
 
 from dataclasses import dataclass
@@ -33,22 +34,29 @@ class Pieces:
         q: Coefficients [rad], shape (n, S, D + 1).
         dq: Coefficients [rad/s], shape (n, S, 2 D).
         ddq: Coefficients [rad/s^2], shape (n, S, 3 D - 1).
+        jerk: Coefficients [rad/s^3], shape (n, S, 4 D - 2); None where they are not wanted.
     """
 
     edges: Array
     q: Array
     dq: Array
     ddq: Array
+    jerk: Array | None = None
 
 
-def polynomials(motion: Motion) -> Pieces:
-    """Return the polynomials of one motion."""
-    degree = motion.degree
+def polynomials(motion: Motion, *, jerk: bool = False) -> Pieces:
+    """Return the polynomials of one motion, those of its jerks if they are wanted."""
     degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
     edges = _edges(len(path), len(rate), degree)
     p, p1, p2 = (_in_bernstein_form(path, degree, order, edges) for order in range(3))
     r, r1 = (_in_bernstein_form(rate, degree, order, edges) for order in range(2))
-    return Pieces(edges, q=p, dq=_product(p1, r), ddq=_product(_product(p2, r) + _product(p1, r1), r))
+    ddq = _product(_product(p2, r) + _product(p1, r1), r)
+    if not jerk:
+        return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq)
+    p3, r2 = _in_bernstein_form(path, degree, 3, edges), _in_bernstein_form(rate, degree, 2, edges)
+    bends = _product(_product(p3, r) + 3 * _product(p2, r1), r)
+    third = _product(bends + _product(p1, _product(r2, r) + _product(r1, r1)), r)
+    return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq, jerk=third)
 
 
 def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0)) -> Peak:

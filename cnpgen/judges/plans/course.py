@@ -20,14 +20,20 @@ class Course:
         q: Joint positions [rad].
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
+        jerk: Joint jerks [rad/s^3]; None where they are not wanted.
     """
 
     q: Array
     dq: Array
     ddq: Array
+    jerk: Array | None = None
+
+    def is_finite(self) -> bool:
+        """Whether all of it are numbers."""
+        return all(values is None or bool(np.isfinite(values).all()) for values in vars(self).values())
 
 
-def course(motion: Motion, s: Array) -> Course:
+def course(motion: Motion, s: Array, *, jerk: bool = False) -> Course:
     """Evaluate one motion at phases s, by the chain rule that ``cnpgen.trajectory.motion.Motion.at`` states.
 
     Many phases of one motion take a tenth of the time that ``Motion.at`` needs for them.
@@ -35,10 +41,11 @@ def course(motion: Motion, s: Array) -> Course:
     Args:
         motion: One motion.
         s: Phases in [0, 1], shape (K,).
+        jerk: Whether jerks are wanted.
     """
     p, p1, p2 = _derivatives(motion.path[0], motion.degree, s, orders=3)
     r, r1 = _derivatives(motion.rate[0, :, None], motion.degree, s, orders=2)
-    return Course(q=p, dq=p1 * r, ddq=(p2 * r + p1 * r1) * r)
+    return Course(q=p, dq=p1 * r, ddq=(p2 * r + p1 * r1) * r, jerk=jerks(motion, s) if jerk else None)
 
 
 def jerks(motion: Motion, s: Array) -> Array:

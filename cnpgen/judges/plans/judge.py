@@ -48,11 +48,11 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     """Judge N plans, each for itself: what one of them holds changes nothing about the others.
 
     A plan is valid if it meets its boundary conditions and exceeds every bound by no more than the constraint allows,
-    at every moment. Limits of joint positions, velocities and accelerations are proven to hold between any two moments
-    (``cnpgen.judges.plans.between``). Every other constraint's ``measured`` form is evaluated with Pinocchio and Coal
-    at moments no further than ``step`` apart and at more of them near both ends (``sampling``); then around every
-    maximum that could decide, until nothing is left to gain (``peaks``), and between moments where contacts could hide
-    more than is allowed (``closer``). Numbers that cannot be evaluated give a verdict that says so, no exception.
+    at every moment. Limits of joint positions, velocities, accelerations and jerks are proven to hold between any two
+    moments (``cnpgen.judges.plans.between``). Every other constraint's ``measured`` form is evaluated with Pinocchio
+    and Coal at moments no further than ``step`` apart and at more of them near both ends (``sampling``); then around
+    every maximum that could decide, until nothing is left to gain (``peaks``), and between moments where contacts could
+    hide more than is allowed (``closer``). Numbers that cannot be evaluated give a verdict that says so, no exception.
 
     Args:
         problem: The problem.
@@ -169,10 +169,10 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     if isinstance(found, Verdict):
         return found
     samples, table = found
-    states = course(plan.motion, samples.s)
-    if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
+    states = course(plan.motion, samples.s, jerk=plan.problem.uses_jerk)
+    if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(states.q, states.dq, states.ddq, plan.tops)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
     ends = boundary_margins(states, plan.boundary, samples, world.robot.joint_names)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
@@ -184,7 +184,7 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
 
 def _margins(survey: Survey) -> list[Margin]:
     """Measure every constraint, at the samples and between them; the survey's world is moved."""
-    pieces, margins = polynomials(survey.motion), []
+    pieces, margins = polynomials(survey.motion, jerk=survey.problem.uses_jerk), []
     proven = {
         id(each): limit_margin(each, survey.world, pieces, survey.samples.s, survey.table)
         for each in survey.problem.constraint
@@ -204,10 +204,10 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     if not plan.is_finite() or not plan.motion.runs_forward()[0]:
         return True
     samples = Samples(_GLANCE, _GLANCE)
-    states = course(plan.motion, samples.s)
-    if not np.all(np.isfinite([states.q, states.dq, states.ddq])):
+    states = course(plan.motion, samples.s, jerk=plan.problem.uses_jerk)
+    if not states.is_finite():
         return True
-    world.set_path(states.q, states.dq, states.ddq, plan.tops)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
     start_tip = world.tip_position[:, 0]
     found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
     if not all((each.share <= 1).all() for each in found):

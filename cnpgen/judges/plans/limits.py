@@ -9,7 +9,7 @@ from cnpgen.judges.plans.between import Pieces, largest
 from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointVelocity
+from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointVelocity
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 LEAST = 1e-9  # of a bound: how exactly the largest excess is found where none is allowed
-_COEFFICIENTS = {JointPosition: "q", JointVelocity: "dq", JointAcceleration: "ddq"}
+_COEFFICIENTS = {JointPosition: "q", JointVelocity: "dq", JointAcceleration: "ddq", JointJerk: "jerk"}
 
 
 def is_proven(constraint: Constraint) -> bool:

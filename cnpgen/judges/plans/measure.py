@@ -16,7 +16,7 @@ from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
@@ -33,7 +33,7 @@ BOUNDARY = {
     "dq": ("boundary velocity", "rad/s", 1e-6),
     "ddq": ("boundary acceleration", "rad/s^2", 1e-4),
 }
-_PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointTorque
+_PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointJerk | JointTorque
 
 
 def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:

@@ -90,21 +90,23 @@ def _along(problem: Problem, robot: Robot, motion: Motion, index: int) -> tuple[
     if not np.all(np.isfinite([q, dq, ddq])):
         raise UsageError(f"plan {index} cannot be drawn: its numbers are not finite")
     world = PathWorld(robot, problem.obstacle, problem.object_size)
-    world.set_path(q, dq, ddq, np.zeros(len(problem.obstacle)))
+    jerk = states.jerk[0].T if problem.uses_jerk else None
+    world.set_path(q, dq, ddq, np.zeros(len(problem.obstacle)), jerk)
     return world, s, t
 
 
 def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
-    """Draw q, dq, ddq and torque of every joint as a share of its limits."""
+    """Draw q, dq, ddq, torque and, where it is constrained, jerk of every joint as a share of its limits."""
     robot = world.robot
     middle, half = (robot.position_upper + robot.position_lower) / 2, (robot.position_upper - robot.position_lower) / 2
     shares = {
         "position": (world.q - middle[:, None]) / half[:, None],
         "velocity": world.dq / robot.velocity_limit[:, None],
         "acceleration": world.ddq / robot.acceleration_limit[:, None],
+        **({} if world.jerk is None else {"jerk": world.jerk / robot.jerk_limit[:, None]}),
         "torque": world.torque / robot.torque_limit[:, None],
     }
-    axes = figure.subplots(4, 1, sharex=True)
+    axes = figure.subplots(len(shares), 1, sharex=True)
     for axis, (name, share) in zip(axes, shares.items(), strict=True):
         for values, joint in zip(share, robot.joint_names, strict=True):
             axis.plot(t, 100 * values, linewidth=1.2, label=joint)

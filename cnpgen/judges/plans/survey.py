@@ -45,8 +45,8 @@ class Survey:
 
     def move(self, s: Array) -> None:
         """Move the robot to phases s, shape (K,)."""
-        states = course(self.motion, s)
-        self.world.set_path(states.q, states.dq, states.ddq, self.tops)
+        states = course(self.motion, s, jerk=self.problem.uses_jerk)
+        self.world.set_path(states.q, states.dq, states.ddq, self.tops, states.jerk)
 
     def measure(self, constraint: Constraint, s: Array) -> list[Measured]:
         """Measure a constraint at phases s, shape (K,), to which the robot was moved."""

@@ -96,6 +96,7 @@ class Constraint(ABC):
     Attributes:
         reason: The name under which a sample that breaks the constraint is counted.
         kinks: Phases at which its ``funnel`` is not smooth; the verdict looks there.
+        uses_jerk: Whether it is about the jerk, which is computed only where a constraint of the problem is.
         tolerance: How far a motion may be outside the condition and still be called valid.
         budget: Acceptable violation while training.
         weight: First weight of the violation while training.
@@ -103,6 +104,7 @@ class Constraint(ABC):
 
     reason: ClassVar[str]
     kinks: ClassVar[tuple[float, ...]] = ()
+    uses_jerk: ClassVar[bool] = False
 
     tolerance: float
     budget: float = field("acceptable violation while training (the paper's C-bar^2)", low=0.0, default=0.0)

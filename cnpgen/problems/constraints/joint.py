@@ -1,10 +1,10 @@
-"""Joint limits: position, velocity, acceleration and torque, each within the planning limits of the robot.
+"""Joint limits: position, velocity, acceleration, jerk and torque, each within the planning limits of the robot.
 
-Tolerances of velocity, acceleration and torque are fractions of the limit.
+Tolerances of all but the position are fractions of the limit.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,29 @@ class JointAcceleration(_RelativeLimit):
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare ddq [rad/s^2] with the limits."""
         return _within("joint acceleration", "rad/s^2", list(world.ddq), world.robot.acceleration_limit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointJerk(_RelativeLimit):
+    """``|jerk| <= jerk limit``: bounded, not continuous.
+
+    It is about motions: a boundary state has no jerk, and meets it.
+    """
+
+    reason = "joint jerk limit"
+    uses_jerk: ClassVar[bool] = True
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the limits on the jerk [rad/s^3], where the state has one."""
+        if state.jerk is None:
+            return ()
+        return _within("joint jerk", "rad/s^3", state.jerk, state.robot.jerk_limit)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Compare the jerk [rad/s^3] with the limits, where the state has one."""
+        if world.jerk is None:
+            return ()
+        return _within("joint jerk", "rad/s^3", list(world.jerk), world.robot.jerk_limit)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """The highest derivative of q that a condition depends on: found out from its forms, so that nobody declares it.
 
-0 is a condition on positions, 1 one on velocities, too, 2 one on accelerations.
+0 is a condition on positions, 1 one on velocities, too, 2 one on accelerations, 3 one on jerks.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,51 +20,56 @@ _SHARES = (0.1, 0.9, 10.0)  # of the limits
 _MIXED = np.cos(np.arange(64.0))  # joints move to both sides, none at the speed of another
 
 
-def symbolic_needs(condition: Condition, dq: Any, ddq: Any) -> int:
+def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
     """Say what a condition in symbolic form depends on.
 
     Args:
         condition: The condition.
-        dq: SX column of the symbols that are in the velocities.
-        ddq: Likewise of those that are in the accelerations alone.
+        derivatives: SX columns: of the symbols that are in the velocities, of those that are in the accelerations
+            alone and, where states have jerks, of those that are in these alone.
     """
     import casadi as ca
 
     g = ca.SX(ca.vertcat(*condition.g))
-    return next((order for order, column in ((2, ddq), (1, dq)) if ca.depends_on(g, column)), 0)
+    orders = range(len(derivatives), 0, -1)
+    return next((order for order in orders if ca.depends_on(g, derivatives[order - 1])), 0)
 
 
-def measured_needs(forms: "Iterable[Callable[[World], Iterable[Condition]]]", world: "World") -> list[int]:
-    """Say what conditions in measured form depend on, in their order: what changes where dq or ddq does.
+def measured_needs(
+    forms: "Iterable[Callable[[World], Iterable[Condition]]]", world: "World", *, jerk: bool = False
+) -> list[int]:
+    """Say what conditions in measured form depend on, in their order: what changes where dq, ddq or the jerk does.
 
-    They are asked where dq or ddq is not a number and, as a form may swallow that, where it is far below its limit,
+    They are asked where one of these is not a number and, as a form may swallow that, where it is far below its limit,
     near it, and far above.
 
     Args:
         forms: What evaluates them: ``measured`` of every constraint, or ``measured_at`` for an end.
         world: Where they are evaluated; it is left at rest in the base configuration.
+        jerk: Whether states have jerks: those of motions do, boundary states do not.
     """
     robot, forms = world.robot, list(forms)
-    rest = np.zeros(robot.n)
-    velocities = [rest + np.nan, *(share * robot.velocity_limit * _MIXED[: robot.n] for share in _SHARES)]
-    accelerations = [rest + np.nan, *(share * robot.acceleration_limit * _MIXED[: robot.n] for share in _SHARES)]
-    by_ddq = _changed(forms, world, [(rest, ddq) for ddq in accelerations])
-    by_dq = _changed(forms, world, [(dq, rest) for dq in velocities])
-    return [2 if second else 1 if first else 0 for first, second in zip(by_dq, by_ddq, strict=True)]
+    limits = [robot.velocity_limit, robot.acceleration_limit, *([robot.jerk_limit] if jerk else [])]
+    rest = [np.zeros(robot.n) for _ in limits]
+    changed = []
+    for order, limit in enumerate(limits):
+        moving = [limit + np.nan, *(share * limit * _MIXED[: robot.n] for share in _SHARES)]
+        changed.append(_changed(forms, world, [[*rest[:order], each, *rest[order + 1 :]] for each in moving]))
+    return [max(order for order, yes in enumerate((True, *each)) if yes) for each in zip(*changed, strict=True)]
 
 
 def _changed(
-    forms: "Sequence[Callable[[World], Iterable[Condition]]]", world: "World", states: Iterable[tuple[Array, Array]]
+    forms: "Sequence[Callable[[World], Iterable[Condition]]]", world: "World", states: Sequence[Sequence[Array]]
 ) -> list[bool]:
     """Say which conditions have another value at one of the states than at rest; the world is left at rest."""
-    tops, rest = np.zeros(len(world.obstacles)), np.zeros(world.robot.n)
+    tops, rest = np.zeros(len(world.obstacles)), [np.zeros(world.robot.n) for _ in states[0]]
 
-    def values(dq: Array, ddq: Array) -> list[Array]:
-        world.set_state(world.robot.base, dq, ddq, tops)
+    def values(dq: Array, ddq: Array, jerk: Array | None = None) -> list[Array]:
+        world.set_state(world.robot.base, dq, ddq, tops, jerk)
         return [np.array(each.g, float) for form in forms for each in form(world)]
 
     moving = [values(*state) for state in states]
-    still = values(rest, rest)
+    still = values(*rest)
     return [
         any(not np.array_equal(one[index], known, equal_nan=True) for one in moving)
         for index, known in enumerate(still)

@@ -28,7 +28,7 @@ class Tightening:
     """How much smaller than the problem's the bounds are, because residuals overshoot between grid points.
 
     Attributes:
-        limit: Fraction of acceleration and torque limits.
+        limit: Fraction of acceleration, torque and jerk limits.
         gentle: Fraction of position and velocity limits (boundary velocities sit on the limit).
         clearance: Distance added to clearances [m].
         band: Half width of equalities, as a fraction of their tolerance.
@@ -49,7 +49,8 @@ class Bounds:
     Attributes:
         lower: Shape (K, m), -inf where there is none.
         upper: Shape (K, m).
-        sharp: Which residuals leap with the last rate control points, shape (K, m): accelerations at the ends.
+        sharp: Which residuals leap with the last rate control points, shape (K, m): those of accelerations and jerks at
+            the ends.
     """
 
     lower: Array
@@ -87,8 +88,9 @@ class BoundsTemplate:
     """
 
     def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
+        forms = [constraint.solved for constraint in problem.constraint]
+        needs = measured_needs(forms, world, jerk=problem.uses_jerk)  # the world is left as the bounds are read off
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
-        needs = measured_needs([constraint.solved for constraint in problem.constraint], world)
         tables = [_bounds(*pair, s, tightening, need) for pair, need in zip(pairs, needs, strict=True)]
         self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
@@ -98,7 +100,7 @@ class BoundsTemplate:
         self.allowed = np.concatenate([_allowed(*pair) for pair in pairs])
         self.needs = np.repeat(needs, [len(each.g) for each in self.conditions])
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
-        self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs == 2
+        self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs >= 2
 
     def of(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:
         """Return the bounds of one motion.
@@ -165,7 +167,7 @@ def _bounds(
     lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
     if condition.exactness == "limit":
-        fraction = tightening.limit if needs == 2 else tightening.gentle
+        fraction = tightening.limit if needs >= 2 else tightening.gentle
         shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
         middle, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = middle - shrink * half, middle + shrink * half

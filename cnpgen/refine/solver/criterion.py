@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.state import SymbolicState, jerk_along, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -26,8 +26,8 @@ class Criterion:
 
     Attributes:
         kind: "centrifugal": e is the tip's acceleration across its velocity [m/s^2] and rho its norm (paper, Appendix
-            B); "effort": torques as fractions of their limits and "jerk": jerks as fractions of 5/s x the acceleration
-            limits, rho the sum of squares.
+            B); "effort": torques as fractions of their limits and "jerk": jerks as fractions of their limits, rho the
+            sum of squares.
         weight: Its weight beside the time [s^2/m] or [1].
     """
 
@@ -76,8 +76,8 @@ def criterion_residuals(robot: "Robot", kind: Kind) -> Any:
     dq = [a * r for a in p1]
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
     if kind == "jerk":
-        jerk = [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in zip(p1, p2, p3, strict=True)]
-        e = [x / float(limit) for x, limit in zip(jerk, robot.jerk_limit, strict=True)]
+        jerk = jerk_along((p1, p2, p3), (r, r1, r2))
+        e = [x / float(limit) for x, limit in zip(jerk or (), robot.jerk_limit, strict=True)]
     else:
         state = SymbolicState(robot, p, dq, ddq, [], (), None)
         e = _across(state) if kind == "centrifugal" else _shares(state)

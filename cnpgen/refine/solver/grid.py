@@ -50,7 +50,7 @@ class Grid:
 
     Attributes:
         s: Phases, shape (K,); s = 0 is left out, nothing can be changed there.
-        bases: Bases there, three orders of p and two of r.
+        bases: Bases there, three orders of p and two of r, or four and three where the jerk is constrained.
         gauss: Basis of r at the nodes of the time integral, shape (Q, R).
         weights: Quadrature weights of the time integral, shape (Q,).
         criterion: Bases at the Gauss nodes of the criterion's integral, four orders of p and three of r: dense at both
@@ -67,8 +67,8 @@ class Grid:
     criterion_weights: Array
 
 
-def make_grid(spec: TrajectorySpec, points: int) -> Grid:
-    """Build the Chebyshev grid of ``points`` phases."""
+def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
+    """Build the Chebyshev grid of ``points`` phases, with bases of so many orders of p."""
     s = chebyshev(points)[1:]
     edges = graded_edges(spec.rate_control_points, spec.degree)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
@@ -77,7 +77,7 @@ def make_grid(spec: TrajectorySpec, points: int) -> Grid:
     few, few_weights = np.polynomial.legendre.leggauss(CRITERION_NODES)
     return Grid(
         s,
-        bases=_bases(spec, s, 3),
+        bases=_bases(spec, s, orders),
         gauss=basis(q, spec.rate_control_points, spec.degree),
         weights=(width * weights / 2).ravel(),
         criterion=_bases(spec, (few + 1) / 2, 4),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.state import SymbolicState, jerk_along, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -18,7 +18,10 @@ FINEST = 1e-9  # a tolerance of zero is taken for this
 
 
 def stage_values(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(w, tops) -> g`` with ``w = (p, p', p'', r, r')``: all residuals at one phase."""
+    """Build ``(w, tops) -> g`` with ``w = (p, p', p'', r, r')``: all residuals at one phase.
+
+    With constraints of the jerk, ``w = (p, p', p'', p''', r, r', r'')``.
+    """
     import casadi as ca
 
     w_sx, tops_sx, g = _stage(robot, problem)
@@ -37,13 +40,15 @@ def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
 
 
 def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
-    n = robot.n
-    (w_sx, w), (tops_sx, tops) = symbols("w", 3 * n + 2), symbols("tops", len(problem.obstacle))
-    p, p1, p2, r, r1 = w[:n], w[n : 2 * n], w[2 * n : 3 * n], w[3 * n], w[3 * n + 1]
+    n, orders = robot.n, problem.path_orders
+    (w_sx, w), (tops_sx, tops) = symbols("w", orders * n + orders - 1), symbols("tops", len(problem.obstacle))
+    p, *path = (w[order * n : (order + 1) * n] for order in range(orders))
+    (p1, p2), rate = path[:2], w[orders * n :]
+    r, r1 = rate[:2]
     dq = [a * r for a in p1]
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
-    size = problem.object_size
-    state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, size)
+    jerk = jerk_along(path, rate)
+    state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, problem.object_size, jerk)
     g = []
     for constraint in problem.constraint:
         for condition in constraint.symbolic(state):

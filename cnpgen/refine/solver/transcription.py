@@ -37,7 +37,7 @@ class Linearisation:
         gradient: Its gradient, shape (nx,).
         curvature: Positive semidefinite model of its Hessian, shape (nx, nx).
         g: Residuals, shape (K, m).
-        jacobian: d(residuals)/d(w), shape (3 n + 2, m, K).
+        jacobian: d(residuals)/d(w), shape (width of w, m, K).
         rate: Rate control points, shape (R,).
     """
 
@@ -121,11 +121,13 @@ class Transcription:
         return self.objective(path, rate), g.T
 
     def end_residuals(self) -> Array:
-        """Evaluate residuals at the start and at the goal, shape (2, m); nan where the goal's acceleration is free."""
-        b, unit = self.boundary, np.array([1.0, 0.0])  # with r = 1 and r' = 0, w is the state itself
-        goal_ddq = np.full(self.n, np.nan) if b.goal_ddq is None else b.goal_ddq[0]
-        start = np.concatenate([b.start_q[0], b.start_dq[0], b.start_ddq[0], unit])
-        goal = np.concatenate([b.goal_q[0], b.goal_dq[0], goal_ddq, unit])
+        """Evaluate residuals at the start and at the goal, shape (2, m); nan where accelerations or jerks are free."""
+        orders = len(self.grid.bases.path)
+        b, unit = self.boundary, np.eye(1, orders - 1)[0]  # with r = 1 and r' = 0, w is the state itself
+        free = np.full(self.n, np.nan)
+        goal_ddq, jerk = free if b.goal_ddq is None else b.goal_ddq[0], [free] * (orders - 3)
+        start = np.concatenate([b.start_q[0], b.start_dq[0], b.start_ddq[0], *jerk, unit])
+        goal = np.concatenate([b.goal_q[0], b.goal_dq[0], goal_ddq, *jerk, unit])
         (g,) = self.stage.values(np.stack([start, goal], axis=1), self._tops[:, :2])
         return np.asarray(g.T)
 
@@ -173,13 +175,15 @@ class Transcription:
         return self._chain(at.jacobian[:, which, k].T, k, at.rate, self.grid.bases)
 
     def leaps(self, at: Linearisation, step: float) -> Array:
-        """Bound how far r' alone can carry residuals when no log r changes by more than ``step``, shape (K, m)."""
-        change = np.abs(self.grid.bases.rate[1]) @ at.rate * step
-        reach: Array = np.abs(at.jacobian[3 * self.n + 1]).T * change[:, None]
+        """Bound how far derivatives of r can carry residuals when no log r changes by more than ``step``: (K, m)."""
+        orders, reach = len(self.grid.bases.path), np.zeros(at.g.shape)
+        for order in range(1, orders - 1):
+            change = np.abs(self.grid.bases.rate[order]) @ at.rate * step
+            reach += np.abs(at.jacobian[orders * self.n + order]).T * change[:, None]
         return reach
 
     def _states(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return w = (p, p', p'', r, r') on the grid, shape (3 n + 2, K), and the control points."""
+        """Return w = (p, p', p'', ..., r, r', ...) on the grid, shape (width, K), and the control points."""
         path, rate = self.unpack(x)
         return self.grid.bases.states(path, rate), path, rate
 

@@ -1,7 +1,8 @@
-"""The files that a URDF names, mostly meshes: where they are looked for, and where they are found."""
+"""URDFs of packages, and the files that a URDF names, mostly meshes: where they are looked for, and found."""
 
 import os
 from collections.abc import Iterator, Sequence
+from importlib import metadata
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
@@ -9,14 +10,29 @@ from cnpgen.errors import RecipeError
 
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
+_EXTRAS = {"example-robot-data": "robots"}  # Python packages of robots -> cnpgen's extra that installs them
+
+
+def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
+    """Find the URDF that a problem names: one of a package, see ``find_named_file``, or one beside the problem's file.
+
+    Args:
+        name: What the problem says.
+        problem: The problem file.
+        packages: Folders that it names.
+
+    Raises:
+        RecipeError: No package has it; with every place that was looked at.
+    """
+    return _find(name, problem, packages) if urlparse(name).scheme in _PACKAGE else problem.parent / name
 
 
 def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Path:
     """Find a file that a URDF names.
 
     ``package://NAME/REST`` is looked for in the folders of ``packages``, in those of the environment variables
-    ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``, and in the URDF's own folder and all above it; each may hold the
-    package or be it. What is no URI is relative to the URDF's folder.
+    ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``, in the URDF's own folder and all above it, and where pip installs a
+    package of this name; each may hold the package or be it. What is no URI is relative to the URDF's folder.
 
     Args:
         name: What the URDF says.
@@ -26,27 +42,34 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
     Raises:
         RecipeError: It is in none of these places; with every one of them.
     """
-    places = list(dict.fromkeys(_places(name, urdf.absolute(), packages)))
+    try:
+        return _find(name, urdf, packages)
+    except RecipeError as error:
+        raise RecipeError([f"{urdf}: {mistake}" for mistake in error.mistakes]) from None
+
+
+def _find(name: str, beside: Path, packages: Sequence[Path]) -> Path:
+    places = list(dict.fromkeys(_places(name, beside.absolute(), packages)))
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         said = "\n".join(f"  {place}" for place in places) or "  nowhere: a file of this kind of address is not read"
-        raise RecipeError([f"{urdf}: the file {name!r} is missing; looked for at\n{said}{_hint(name)}"])
+        raise RecipeError([f"the file {name!r} is missing; looked for at\n{said}{_hint(name)}"])
     return found
 
 
-def _places(name: str, urdf: Path, packages: Sequence[Path]) -> Iterator[Path]:
-    """List where a file could be, the likeliest first."""
+def _places(name: str, beside: Path, packages: Sequence[Path]) -> Iterator[Path]:
+    """List where a file that another one names could be, the likeliest first."""
     parts = urlparse(name)
     if parts.scheme in _PACKAGE:
         package, rest = unquote(parts.netloc), unquote(parts.path).lstrip("/")
-        for folder in (*packages, *_of_environment(), *urdf.parents):
+        for folder in (*packages, *_of_environment(), *beside.parents, *_of_distribution(package)):
             yield folder / package / rest
             if folder.name == package:
                 yield folder / rest
     elif parts.scheme == "file":
         yield Path(unquote(parts.path))
     elif not parts.scheme:
-        yield urdf.parent / name
+        yield beside.parent / name
 
 
 def _of_environment() -> Iterator[Path]:
@@ -56,7 +79,20 @@ def _of_environment() -> Iterator[Path]:
             yield Path(folder) / "share" if variable == "AMENT_PREFIX_PATH" else Path(folder)
 
 
+def _of_distribution(name: str) -> Iterator[Path]:
+    """List the folders in which an installed Python package of this name keeps its data."""
+    try:
+        installed = metadata.distribution(name)
+    except (metadata.PackageNotFoundError, ValueError):
+        return
+    for folder in ("cmeel.prefix/share", "share", ""):  # the first is where those that come with Pinocchio do
+        yield Path(str(installed.locate_file(folder)))
+
+
 def _hint(name: str) -> str:
-    if urlparse(name).scheme not in _PACKAGE:
+    parts = urlparse(name)
+    if parts.scheme not in _PACKAGE:
         return ""
+    if extra := _EXTRAS.get(parts.netloc):
+        return f"\nrobots of this package come with pip install 'cnpgen[{extra}]'"
     return f"\nname a folder that holds the package as 'packages' in [robot], or in {' or '.join(_SEARCHED)}"
