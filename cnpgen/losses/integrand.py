@@ -12,6 +12,7 @@ from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldSta
     sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
     p, dp, ddp, rate = sym("p", n), sym("dp", n), sym("ddp", n), sym("rate", 2)
     dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
-    tops, size = sym("tops", len(problem.obstacle)), problem.object_size
+    tops, size = sym("tops", count_numbers(problem.obstacle)), problem.object_size
     q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
     state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size)
     pairs = stated(problem, state, form)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState, Vec, symbols
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ def equality_residuals(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, tops) -> (r, dr/dq)``: how far positions are off the manifold's equalities, column by column."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
     rows = [
         value - float(wanted)
         for condition, needs in _conditions(robot, problem, _moving(robot, q), tops)
@@ -38,7 +39,7 @@ def speed_residuals(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, dq, ddq, tops) -> g``: every value bounded by the problem that depends on how fast a path is run."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
     state = _moving(robot, q)
     rows = [value for condition, needs in _conditions(robot, problem, state, tops) if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
@@ -54,7 +55,7 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
     import casadi as ca
 
     n, names = robot.n, ("p", "p1", "p2", "rates", "tops")
-    widths = (n, n, n, 2, len(problem.obstacle))
+    widths = (n, n, n, 2, count_numbers(problem.obstacle))
     columns, (p, p1, p2, (r, r1), tops) = zip(*map(symbols, names, widths), strict=True)
     dq = [slope * r for slope in p1]
     ddq = [(curve * r + slope * r1) * r for curve, slope in zip(p2, p1, strict=True)]
@@ -101,7 +102,7 @@ def _moving(robot: "Robot", q: Vec) -> _State:
 
 
 def _any_conditions(robot: "Robot", problem: Problem) -> list[tuple[Condition, int]]:
-    tops = symbols("tops", len(problem.obstacle))[1]
+    tops = symbols("tops", count_numbers(problem.obstacle))[1]
     return _conditions(robot, problem, _moving(robot, symbols("q", robot.n)[1]), tops)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
 
 def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
     n = robot.n
-    (w_sx, w), (tops_sx, tops) = symbols("w", 3 * n + 2), symbols("tops", len(problem.obstacle))
+    (w_sx, w), (tops_sx, tops) = symbols("w", 3 * n + 2), symbols("tops", count_numbers(problem.obstacle))
     p, p1, p2, r, r1 = w[:n], w[n : 2 * n], w[2 * n : 3 * n], w[3 * n], w[3 * n + 1]
     dq = [a * r for a in p1]
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
