@@ -91,9 +91,9 @@ from cnpgen.refine.proof.proof import Feasibility as Feasibility
 from cnpgen.refine.proof.proof import explain_plans as explain_plans
 from cnpgen.refine.task import Outcome as Outcome
 from cnpgen.refine.task import Refined as Refined
+from cnpgen.robots.obstacle import Obstacle as Obstacle
 from cnpgen.robots.spec import HeldObject as HeldObject
 from cnpgen.robots.spec import LimitSpec as LimitSpec
-from cnpgen.robots.spec import Obstacle as Obstacle
 from cnpgen.robots.spec import Payload as Payload
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes

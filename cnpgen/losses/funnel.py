@@ -10,6 +10,7 @@ from cnpgen.errors import UsageError
 from cnpgen.losses.integrand import has_funnel, stated
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def make_funnel(problem: Problem, robot: "Robot", form: str) -> Funnel:
     import casadi as ca
 
     q, dq, ddq = (ca.vertsplit(ca.SX.sym(name, robot.n)) for name in ("q", "dq", "ddq"))
-    tops = ca.vertsplit(ca.SX.sym("tops", len(problem.obstacle)))
+    tops = ca.vertsplit(ca.SX.sym("tops", count_numbers(problem.obstacle)))
     size = problem.object_size
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
     chosen = stated(filter(has_funnel, problem.constraint), state, form)

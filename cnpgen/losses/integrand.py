@@ -13,6 +13,7 @@ from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState, jerk_along
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldSta
     p, dp, ddp, *_ = path = tuple(sym("d" * order + "p", n) for order in range(orders))
     rate = sym("rate", orders - 1)
     dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
-    tops, size = sym("tops", len(problem.obstacle)), problem.object_size
+    tops, size = sym("tops", count_numbers(problem.obstacle)), problem.object_size
     q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
     jerk = jerk_along([ca.vertsplit(column) for column in path[1:]], ca.vertsplit(rate))
     state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size, jerk)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.schema.arguments import numbers
 
 Array = NDArray[Any]
@@ -97,17 +98,18 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
     Raises:
         UsageError: A shape is wrong, or the heights of the obstacles are missing.
     """
-    spec, obstacles = problem.trajectory, len(problem.obstacle)
-    if obstacles and "tops" not in shapes:
+    spec, numbers = problem.trajectory, count_numbers(problem.obstacle)
+    if numbers and "tops" not in shapes:
         names = ", ".join(box.name for box in problem.obstacle)
         raise UsageError(
-            f"tops is missing: the problem {problem.name!r} has obstacles ({names}), whose heights it gives"
+            f"tops is missing: the problem {problem.name!r} has obstacles ({names}), and it says where they are:"
+            " cnpgen.obstacle_tops"
         )
     count = next(iter(shapes["path"]), 0)
     tails = {
         "path": (spec.path_control_points, len(problem.robot.joints)),
         "rate": (spec.rate_control_points,),
-        "tops": (obstacles,),
+        "tops": (numbers,),
         "start_tip": (3,),
     }
     for name, tail in tails.items():

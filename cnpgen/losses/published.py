@@ -14,6 +14,7 @@ from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.symbolic.linalg import add, dot, scale, subtract
+from cnpgen.symbolic.solids import BoxForm, symbolic_solids
 from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics
 
 APART = 0.1  # m: no point on the robot is further than this from its neighbour
@@ -29,11 +30,14 @@ def published(constraint: Constraint, state: SymbolicState) -> tuple[Condition, 
 
     if isinstance(constraint, Vertical):
         return _zero("orientation", "1", 1 - state.kinematics.rotation[2][2])
+    boxes = [solid.bounds for solid in symbolic_solids(state) if isinstance(solid, BoxForm) and solid.rotation is None]
+    if len(boxes) < len(state.obstacles):
+        return constraint.penalised(state)
     if isinstance(constraint, RobotClearance) and (radius := constraint.radius) is not None:
-        near = (radius - _distance(point, state.boxes) for point in _points(state))
+        near = (radius - _distance(point, boxes) for point in _points(state))
         return _zero("robot clearance", "m", sum(ca.fmax(x, 0) for x in near))
     if isinstance(constraint, ObjectContact):
-        deep = (-_depth(corner, box) - constraint.depth for corner in _corners(state) for box in state.boxes)
+        deep = (-_depth(corner, box) - constraint.depth for corner in _corners(state) for box in boxes)
         return _zero("object contact", "m", sum(ca.fmax(x, 0) for x in deep))
     return constraint.penalised(state)
 

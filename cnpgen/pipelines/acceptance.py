@@ -15,6 +15,7 @@ from cnpgen.pipelines.undecided import settle, unmet
 from cnpgen.problems.constraints.constraint import EXACTNESS, End
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.store.field import Field
 from cnpgen.symbolic.linalg import Scalar, dot, subtract
 from cnpgen.symbolic.state import SymbolicState, symbols
@@ -98,7 +99,7 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
     """
     import casadi as ca
 
-    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", len(problem.obstacle)), ("p", 3))
+    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", count_numbers(problem.obstacle)), ("p", 3))
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops), (p_sx, p) = (symbols(name, width) for name, width in names)
     size = problem.object_size
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.pipelines.context import Context
 from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.linalg import Scalar
 from cnpgen.symbolic.state import SymbolicState, symbols
 from cnpgen.world.state import World
@@ -37,7 +38,7 @@ def settle(context: Context, end: End, *, exact: bool = True) -> Settle | None:
         of the N are worth asking for; it says which constraints these break, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot
-    if robot.shape is None:
+    if robot.shape is None and all(each.upright for each in problem.obstacle):
         return None
     kernel = context.kernels.load(undecided, end=end, dtype=context.dtype)
     world = World(robot, problem.obstacle, problem.object_size)
@@ -69,7 +70,9 @@ def undecided(robot: "Robot", problem: Problem, *, end: End, dtype: str) -> Any:
     """Build ``(q, dq, ddq, tops) -> doubts``: positive for constraints whose sufficient conditions are not all met."""
     import casadi as ca
 
-    columns = [symbols(name, robot.n) for name in ("q", "dq", "ddq")] + [symbols("tops", len(problem.obstacle))]
+    columns = [symbols(name, robot.n) for name in ("q", "dq", "ddq")] + [
+        symbols("tops", count_numbers(problem.obstacle))
+    ]
     (q, dq, ddq, tops), size = [scalars for _, scalars in columns], problem.object_size
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, size)
     rows: list[Scalar] = []

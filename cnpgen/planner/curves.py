@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.planner.bending import bend
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import Vec, symbols
 from cnpgen.trajectory.spline import end_derivatives
 
@@ -25,7 +26,7 @@ def line_bend(robot: "Robot", problem: Problem, *, steps: int) -> Any:
     """Build ``(ends, rate, tops) -> change`` of the interior control points on the line, at a constant rate [1/s]."""
     import casadi as ca
 
-    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * robot.n), symbols("tops", len(problem.obstacle))
+    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * robot.n), symbols("tops", count_numbers(problem.obstacle))
     rate = ca.SX.sym("rate")
     points = _points(ends, [rate] * problem.trajectory.rate_control_points, problem.trajectory)
     change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
@@ -37,7 +38,7 @@ def landed_path(robot: "Robot", problem: Problem, *, steps: int) -> Any:
     import casadi as ca
 
     spec, n = problem.trajectory, robot.n
-    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * n), symbols("tops", len(problem.obstacle))
+    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * n), symbols("tops", count_numbers(problem.obstacle))
     rates_sx, rates = symbols("rates", spec.rate_control_points)
     offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - FIXED_AT_GOAL) * n)
     points, interior = _points(ends, rates, spec), slice(3, -FIXED_AT_GOAL)
@@ -68,7 +69,10 @@ def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int) -> Any:
 
 def _path_bend(robot: "Robot", problem: Problem, steps: int) -> tuple[Any, Any, Any]:
     points = problem.trajectory.path_control_points
-    (path_sx, path), (tops_sx, tops) = symbols("path", points * robot.n), symbols("tops", len(problem.obstacle))
+    (path_sx, path), (tops_sx, tops) = (
+        symbols("path", points * robot.n),
+        symbols("tops", count_numbers(problem.obstacle)),
+    )
     change = bend(robot, problem, _split(path, robot.n), tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
     return path_sx, tops_sx, _column(change)
 

@@ -11,6 +11,7 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState, Vec, jerk_along, symbols
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def equality_residuals(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, tops) -> (r, dr/dq)``: how far positions are off the manifold's equalities, column by column."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
     rows = [
         value - float(wanted)
         for condition, needs in _conditions(robot, problem, _moving(problem, q), tops)
@@ -42,7 +43,7 @@ def speed_residuals(robot: "Robot", problem: Problem) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
     state = _moving(problem, q)
     rows = [value for condition, needs in _conditions(robot, problem, state, tops) if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
@@ -61,7 +62,7 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
 
     orders = problem.path_orders
     names = (*(f"p{order}" for order in range(orders)), "rates", "tops")
-    widths = (*[robot.n] * orders, orders - 1, len(problem.obstacle))
+    widths = (*[robot.n] * orders, orders - 1, count_numbers(problem.obstacle))
     columns, (p, *path, rate, tops) = zip(*map(symbols, names, widths), strict=True)
     (p1, p2), (r, r1) = path[:2], rate[:2]
     dq = [slope * r for slope in p1]
@@ -111,7 +112,7 @@ def _moving(problem: Problem, q: Vec) -> _State:
 
 
 def _any_conditions(robot: "Robot", problem: Problem) -> list[tuple[Condition, int]]:
-    tops = symbols("tops", len(problem.obstacle))[1]
+    tops = symbols("tops", count_numbers(problem.obstacle))[1]
     return _conditions(robot, problem, _moving(problem, symbols("q", robot.n)[1]), tops)
 
 

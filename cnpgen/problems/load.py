@@ -5,11 +5,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes
 from cnpgen.problems.problem import FILES, Problem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.files import find_named_file
+from cnpgen.robots.shape.inline import inline_mesh, is_inline
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
@@ -71,10 +76,27 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     before = len(mistakes)
     mistakes.extend(problem_mistakes(table, where, path.parent))
     mistakes.extend(geometry_mistakes(table, where, path.parent))
+    obstacles = () if problem is None else _with_meshes(problem, path, where, mistakes)
     if problem is None or len(mistakes) > before:
         return None
     spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
-    return replace(problem, path=path.absolute(), robot=spec)
+    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles)
+
+
+def _with_meshes(problem: Problem, path: Path, where: Place, mistakes: list[str]) -> tuple[Obstacle, ...]:
+    """Return the obstacles with the hulls of their mesh files in them, so that they need no other file."""
+    packages = [path.parent / each for each in problem.robot.packages]
+    found = []
+    for index, each in enumerate(problem.obstacle):
+        obstacle = each
+        if each.mesh and not is_inline(each.mesh):
+            try:
+                mesh = inline_mesh(find_named_file(each.mesh, path, packages), np.array(each.scale))
+                obstacle = replace(each, mesh=mesh, scale=Obstacle.scale)
+            except RecipeError as error:
+                mistakes += [(where / "obstacle" / index / "mesh").says(text) for text in error.mistakes]
+        found.append(obstacle)
+    return tuple(found)
 
 
 def without_defaults(value: Any) -> Any:

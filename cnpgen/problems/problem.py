@@ -11,10 +11,11 @@ from typing import Any
 
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.files import find_urdf
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.srdf import with_disabled_pairs
-from cnpgen.robots.spec import HeldObject, LimitSpec, Obstacle, Payload, RobotSpec
+from cnpgen.robots.spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.keys import NAME, field, to_dict
@@ -47,7 +48,7 @@ class Problem:
     limits: LimitSpec = field("its planning limits")
     object: HeldObject | None = field("what it holds", default=None)
     payload: Payload | None = field("what else it carries at its tip", default=None, late=True)
-    obstacle: tuple[Obstacle, ...] = field("the boxes of the world", default=(), form="[[obstacle]] tables")
+    obstacle: tuple[Obstacle, ...] = field("what stands around the robot", default=(), form="[[obstacle]] tables")
     constraint: tuple[Constraint, ...] = field("the constraint manifold", default=(), form="[[constraint]] tables")
     trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
     objective: Objective = field("what a good motion is", default=Objective())

@@ -1,4 +1,4 @@
-"""What a problem file says of its robot: the URDF, the joints and limits, what it holds, the boxes around it."""
+"""What a problem file says of its robot: the URDF, the joints and limits, what it holds and carries."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -129,30 +129,3 @@ class HeldObject:
     """An upright cuboid rigidly held at the tip frame, its centre."""
 
     size: tuple[float, float, float] = field("edge lengths along the tip frame's x, y, z", unit="m", low=1e-6)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """An axis-aligned box of the world; without ``top`` the box ends ``below`` the object at that end of the motion."""
-
-    name: str = field("name of the obstacle")
-    x: Range = field("extent along world x", unit="m")
-    y: Range = field("extent along world y", unit="m")
-    height: float | None = field(
-        "height of the box, measured down from its top; none: it extends down without end",
-        unit="m",
-        default=None,
-        low=1e-6,
-    )
-    top: float | None = field("height of its upper face", unit="m", default=None)
-    below: str = field("the end whose object stands on this box", choices=("", "start", "goal"), default="")
-
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
-        if self.top is None and not self.below:
-            yield "top", f"obstacle {self.name!r} has no height: expected a 'top', or 'below' = \"start\" or \"goal\""
-        if self.top is not None and self.below:
-            yield "top", f"obstacle {self.name!r} has both a 'top' and a 'below', expected one of them"
-        for key, extent in (("x", self.x), ("y", self.y)):
-            if extent.low == extent.high:
-                yield key, f"obstacle {self.name!r} has no extent here, expected a low end below the high end"

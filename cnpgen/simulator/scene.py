@@ -15,7 +15,9 @@ from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import Joint
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import Box, Solid, solids_of
 from cnpgen.simulator import hockey
 from cnpgen.simulator.plant import Plant, joint_friction
 
@@ -49,7 +51,7 @@ class Scene:
         problem: The problem.
         robot: Its robot.
         plant: What is different from what the controller believes.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        tops: What says where the obstacles are, as ``cnpgen.obstacle_tops`` returns it.
         puck: Where the puck lies [m], shape (2,), or None if there is none.
     """
 
@@ -73,6 +75,7 @@ def scene_xml(scene: Scene) -> str:
 <option timestep="{STEP}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
 <visual><global offwidth="1280" offheight="960"/><headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
 <default><geom contype="0" conaffinity="0" mass="0"/></default>
+<asset>{"".join(_meshes(scene))}</asset>
 <worldbody>
 <light pos="0 0 4" dir="0 0 -1" diffuse="0.4 0.4 0.4"/>
 <geom type="plane" pos="0 0 -0.5" size="4 4 0.1" rgba="0.9 0.9 0.92 1"/>
@@ -128,12 +131,8 @@ def _inertial(joint: Joint, mass: float) -> str:
 
 def _surroundings(scene: Scene) -> Iterator[str]:
     """Yield the obstacles; with a table, the table and its puck."""
-    for box, top in zip(scene.problem.obstacle, scene.tops.tolist(), strict=True):
-        low = top - (DEEP if box.height is None else box.height)
-        centre = np.array([box.x.low + box.x.high, box.y.low + box.y.high, low + top]) / 2
-        half = np.array([box.x.high - box.x.low, box.y.high - box.y.low, top - low]) / 2
-        yield f'<geom name="{box.name}" type="box" pos="{_numbers(centre)}" size="{_numbers(half)}"'
-        yield ' rgba="0.6 0.65 0.7 1"/>'
+    for obstacle, solid in zip(scene.problem.obstacle, _solids(scene), strict=True):
+        yield f'<geom name="{obstacle.name}" {_shape(obstacle, solid)} rgba="0.6 0.65 0.7 1"/>'
     if scene.height is None:
         return
     surface = scene.height - hockey.MALLET_HEIGHT
@@ -149,6 +148,31 @@ def _surroundings(scene: Scene) -> Iterator[str]:
     yield f'<geom type="cylinder" size="{hockey.MALLET_RADIUS} 0.01" pos="0 0 0.01" rgba="0.15 0.15 0.15 1"/>'
     yield f'<geom type="cylinder" size="0.015 {hockey.MALLET_HEIGHT / 2}" pos="0 0 {hockey.MALLET_HEIGHT / 2}"'
     yield ' rgba="0.15 0.15 0.15 1"/></body>'
+
+
+def _shape(obstacle: Obstacle, solid: Solid) -> str:
+    """Write what an obstacle is and where."""
+    if isinstance(solid, Box):
+        low = solid.low if obstacle.height is not None else np.array([*solid.low[:2], solid.high[2] - DEEP])
+        return f'type="box" pos="{_numbers((low + solid.high) / 2)}" size="{_numbers((solid.high - low) / 2)}"'
+    if obstacle.kind == "sphere":
+        return f'type="sphere" pos="{_numbers(solid.position)}" size="{solid.radius!r}"'
+    if obstacle.kind == "capsule":
+        ends = _numbers(np.ravel(solid.position + solid.corners))
+        return f'type="capsule" fromto="{ends}" size="{solid.radius!r}"'
+    return f'type="mesh" mesh="{obstacle.name}"'
+
+
+def _meshes(scene: Scene) -> Iterator[str]:
+    """Yield the hulls of obstacles that are neither boxes along the world's axes nor round."""
+    for obstacle, solid in zip(scene.problem.obstacle, _solids(scene), strict=True):
+        if not isinstance(solid, Box) and not solid.radius:
+            corners = _numbers(np.ravel(solid.position + solid.corners))
+            yield f'<mesh name="{obstacle.name}" vertex="{corners}"/>'
+
+
+def _solids(scene: Scene) -> list[Solid]:
+    return solids_of(scene.problem.obstacle, scene.tops)
 
 
 def _puck(surface: float, height: float) -> Iterator[str]:

@@ -16,9 +16,9 @@ from cnpgen.robots.chain import Chain, Joint
 from cnpgen.symbolic.linalg import Scalar, add, cross, dot, scale, subtract
 
 if TYPE_CHECKING:
+    from cnpgen.robots.obstacle import Obstacle
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.capsule import Capsule
-    from cnpgen.robots.spec import Obstacle
 
 Vec = list[Scalar]
 
@@ -189,8 +189,8 @@ class SymbolicState:
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
-        tops: Heights of the obstacles' upper faces [m], one scalar per obstacle.
-        obstacles: The boxes of the world.
+        tops: The numbers of the obstacles (``cnpgen.robots.solid``): heights of upright boxes [m], and what poses say.
+        obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
     """
 
@@ -263,14 +263,6 @@ class SymbolicState:
             return first, second, capsule.radius
         rotation, origin = self.kinematics.frames[joint - 1], self.kinematics.origins[joint - 1]
         return add(origin, _times(rotation, first)), add(origin, _times(rotation, second)), capsule.radius
-
-    @property
-    def boxes(self) -> list[list[tuple[Scalar | None, Scalar | None]]]:
-        """Bounds of the obstacles along x, y, z [m]."""
-        return [
-            [(box.x.low, box.x.high), (box.y.low, box.y.high), (None if box.height is None else top - box.height, top)]
-            for box, top in zip(self.obstacles, self.tops, strict=True)
-        ]
 
     def hold(self, value: Scalar) -> Scalar:
         """Return a value that the derivative of what it is used in may take as a constant; here nothing is held."""

@@ -1,53 +1,21 @@
-"""Distances of the pieces of a robot's shape from obstacles and from each other: measured by Coal, and certified.
-
-Whatever direction Coal says two bodies are apart in, how far they are apart along it can be computed, and is a lower
-bound of their signed distance. So no failure of Coal's makes bodies look further apart than they are.
-"""
+"""Distances of the pieces of a robot's shape from obstacles and from each other."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
+from cnpgen.robots.shape.hull import CUBE, ball_round
 from cnpgen.robots.shape.shape import Shape
-from cnpgen.world.scene import ENDLESS
+from cnpgen.robots.solid import Solid, same_shape
+from cnpgen.world.certified import CertifiedDistance, body
 from cnpgen.world.sweep import sweep
-
-if TYPE_CHECKING:
-    from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
 
-# Tolerances of GJK and EPA. With both at 1e-9, EPA fails for 2 % of the overlaps of a hull and a round shape; with the
-# first pair 50,000 distances of hulls and boxes are exact to 1e-9 m. The second is for what the first cannot solve.
-TOLERANCES = ((1e-9, 1e-6), (1e-6, 1e-6), (1e-6, 1e-4))
-CERTAIN = 1e-6  # m: what is measured and what is certified may differ by this much
 NO_SHAPE = 'a constraint is about the shape of the robot, which has none: it needs geometry = "urdf" in [robot]'
-
-
-@dataclass(frozen=True)
-class _Body:
-    """A convex body in one of the frames.
-
-    Attributes:
-        frame: Index of its frame.
-        corners: Corners of its hull there [m], shape (V, 3).
-        radius: How thick the hull is wrapped [m].
-        centre: Centre of a ball that holds it [m], shape (3,).
-        reach: Radius of the ball [m].
-        shape: The hull as Coal's.
-    """
-
-    frame: int
-    corners: Array
-    radius: float
-    centre: Array
-    reach: float
-    shape: Any
 
 
 class Bodies:
@@ -57,7 +25,7 @@ class Bodies:
 
     Args:
         shape: The robot's shape.
-        obstacles: The boxes of the world.
+        n_obstacles: Number of obstacles.
         n_joints: Number of the robot's planned joints.
 
     Attributes:
@@ -65,41 +33,43 @@ class Bodies:
         among_links: Pairs of pieces of links that must not touch, shape (M, 2).
     """
 
-    def __init__(self, shape: Shape, obstacles: "Sequence[Obstacle]", n_joints: int) -> None:
-        import coal
-
-        self._obstacles = tuple(obstacles)
-        self._bodies = [_body(shape.joints[each.link], each.vertices, each.radius) for each in shape.pieces]
-        boxes = range(len(self._bodies), len(self._bodies) + len(self._obstacles))
-        self._bodies += [_body(n_joints + 1 + i, CUBE * _size(box)) for i, box in enumerate(self._obstacles)]
-        moving = [index for index, each in enumerate(shape.pieces) if shape.joints[each.link]]
-        self.from_obstacles = _pairs((box, piece) for piece in moving for box in boxes)
+    def __init__(self, shape: Shape, n_obstacles: int, n_joints: int) -> None:
+        pieces, n_pieces = shape.pieces, len(shape.pieces)
+        self._bodies, self._solids = [body(each.vertices, each.radius) for each in pieces], list[Solid]()
+        self._frames = [shape.joints[each.link] for each in pieces] + [n_joints + 1 + i for i in range(n_obstacles)]
+        self._balls = [(*ball_round(each.vertices, each.radius), np.zeros(3)) for each in pieces]
+        moving = [index for index, frame in enumerate(self._frames[:n_pieces]) if frame]
+        obstacles = range(n_pieces, n_pieces + n_obstacles)
+        self.from_obstacles = _pairs((obstacle, piece) for piece in moving for obstacle in obstacles)
         self.among_links = _pairs(shape.apart)
         self._holding = [_holding(shape, joint) for joint in sorted(set(shape.joints.values()) - {0})]
-        self._frames = [body.frame for body in self._bodies]
-        self._centres = np.array([body.centre for body in self._bodies])
-        boxed = np.array([body.frame > n_joints for body in self._bodies])
-        self._reach = np.where(boxed, 0.0, [body.reach for body in self._bodies])
-        self._half = np.where(boxed[:, None], [np.ptp(body.corners, axis=0) / 2 for body in self._bodies], 0.0)
-        self._requests = [coal.DistanceRequest() for _ in TOLERANCES]
-        for request, (gjk, epa) in zip(self._requests, TOLERANCES, strict=True):
-            request.gjk_tolerance, request.epa_tolerance = gjk, epa
-        self._result, self._places = coal.DistanceResult(), (coal.Transform3s(), coal.Transform3s())
+        self._coal = CertifiedDistance()
+        self._stand([])
 
-    def place(self, rotations: Array, positions: Array, tops: Array) -> None:
+    def place(self, rotations: Array, positions: Array, solids: Sequence[Solid]) -> None:
         """Move to K states.
 
         Args:
             rotations: Rotation matrices of the joints' frames, that of the base first, shape (n + 1, 3, 3, K).
             positions: Their origins [m], shape (n + 1, 3, K).
-            tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
+            solids: The obstacles.
         """
         count = rotations.shape[-1]
-        middles = [_middle(box, top) for box, top in zip(self._obstacles, tops.tolist(), strict=True)]
-        still = np.broadcast_to(np.eye(3)[..., None], (len(middles), 3, 3, count))
+        if len(solids) != len(self._solids) or not all(map(same_shape, solids, self._solids)):
+            self._stand(solids)
+        self._solids = list(solids)
+        still = np.broadcast_to(np.eye(3)[..., None], (len(solids), 3, 3, count))
         self._rotations = np.concatenate([rotations, still])
-        middle = np.array(middles).reshape(-1, 3, 1)
-        self._positions = np.concatenate([positions, np.broadcast_to(middle, (len(middles), 3, count))])
+        middle = np.array([each.position for each in solids]).reshape(-1, 3, 1)
+        self._positions = np.concatenate([positions, np.broadcast_to(middle, (len(solids), 3, count))])
+
+    def _stand(self, solids: Sequence[Solid]) -> None:
+        """Make bodies of the obstacles. They are bounded by boxes, pieces by balls."""
+        n_pieces = len(self._balls)
+        self._bodies = self._bodies[:n_pieces] + [body(each.corners, each.radius) for each in solids]
+        ends = [(each.corners.min(axis=0), each.corners.max(axis=0), each.radius) for each in solids]
+        boxes = [((low + high) / 2, 0.0, (high - low) / 2 + radius) for low, high, radius in ends]
+        self._centres, self._reach, self._half = map(np.array, zip(*self._balls, *boxes, strict=True))
 
     def distances(self, pairs: Pairs) -> list[Array]:
         """Measure the signed distances of pairs of bodies [m]; minus the depth where they overlap.
@@ -113,8 +83,7 @@ class Bodies:
         count = self._positions.shape[-1]
         if not (np.isfinite(self._positions).all() and np.isfinite(self._rotations).all()):
             return [np.full(count, np.nan) for _ in pairs]
-        ends = [(self._bodies[a], self._bodies[b]) for a, b in pairs.tolist()]
-        bounds = self._bounds(pairs)
+        bounds, ends = self._bounds(pairs), [(int(a), int(b)) for a, b in pairs]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._measure(*ends[pair], k)
@@ -142,42 +111,23 @@ class Bodies:
         centre = np.where(outside > 0, outside, beyond.max(axis=1))
         return np.asarray(centre - (self._reach[first] + self._reach[second])[:, None])
 
-    def _measure(self, a: _Body, b: _Body, k: int) -> tuple[float, Array]:
+    def _measure(self, a: int, b: int, k: int) -> tuple[float, Array]:
         """Measure a pair at a state; the direction is that in which b is away from a, in the frame of a."""
-        import coal
+        pose_a, pose_b = (
+            (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
+            for frame in (self._frames[a], self._frames[b])
+        )
+        distance, away = self._coal.between(self._bodies[a], pose_a, self._bodies[b], pose_b)
+        return distance, away @ pose_a[0]
 
-        poses = [
-            (self._rotations[each.frame, ..., k].copy(), self._positions[each.frame, :, k].copy()) for each in (a, b)
-        ]
-        for pose, place in zip(poses, self._places, strict=True):
-            place.setRotation(pose[0])
-            place.setTranslation(pose[1])
-        best, away = -np.inf, np.full(3, np.nan)
-        for request in self._requests:
-            self._result.clear()
-            found = coal.distance(a.shape, self._places[0], b.shape, self._places[1], request, self._result)
-            direction = np.array(self._result.normal)
-            (turn_a, at_a), (turn_b, at_b) = poses
-            nearest = (b.corners @ (direction @ turn_b)).min() - b.radius + direction @ at_b
-            furthest = (a.corners @ (direction @ turn_a)).max() + a.radius + direction @ at_a
-            certified = float(nearest - furthest)
-            if certified > best:  # where there is no direction it is nan, which is not
-                best, away = certified, direction @ turn_a
-            if abs(found - a.radius - b.radius - certified) <= CERTAIN:
-                break
-        return best, away
-
-    def _apart(self, a: _Body, b: _Body, direction: Array) -> Array:
+    def _apart(self, a: int, b: int, direction: Array) -> Array:
         """Compute how far b is from a along a direction in the frame of a at every state [m], shape (K,)."""
-        along = np.einsum("ijk,j->ik", self._rotations[a.frame], direction)
-        in_b = np.einsum("ijk,ik->jk", self._rotations[b.frame], along)
-        between = self._positions[b.frame] - self._positions[a.frame]
-        reach = float((a.corners @ direction).max()) + a.radius + b.radius
-        return np.asarray((b.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
-
-
-def _body(frame: int, corners: Array, radius: float = 0.0) -> _Body:
-    return _Body(frame, corners, radius, *ball_round(corners, radius), coal_hull(corners))
+        (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
+        along = np.einsum("ijk,j->ik", self._rotations[frame], direction)
+        in_b = np.einsum("ijk,ik->jk", self._rotations[other], along)
+        between = self._positions[other] - self._positions[frame]
+        reach = float((first.corners @ direction).max()) + first.radius + second.radius
+        return np.asarray((second.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
 
 
 def _holding(shape: Shape, joint: int) -> tuple[int, Array]:
@@ -190,12 +140,3 @@ def _holding(shape: Shape, joint: int) -> tuple[int, Array]:
 
 def _pairs(found: Any) -> Pairs:
     return np.array(list(found), np.intp).reshape(-1, 2)
-
-
-def _size(box: "Obstacle") -> Array:
-    return np.array([box.x.high - box.x.low, box.y.high - box.y.low, box.height or ENDLESS])
-
-
-def _middle(box: "Obstacle", top: float) -> Array:
-    middle = (box.x.low + box.x.high) / 2, (box.y.low + box.y.high) / 2, top - (box.height or ENDLESS) / 2
-    return np.array(middle)

@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.world.bodies import NO_SHAPE, Bodies
-from cnpgen.world.scene import ENDLESS, Scene
-from cnpgen.world.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.world.scene import Scene
+from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
 from cnpgen.world.sweep import sweep
 from cnpgen.world.trace import trace
 
 if TYPE_CHECKING:
+    from cnpgen.robots.obstacle import Obstacle
     from cnpgen.robots.robot import Robot
-    from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
 
@@ -31,12 +32,12 @@ class PathWorld:
 
     Args:
         robot: The robot.
-        obstacles: The boxes of the world.
+        obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
 
     Attributes:
         robot: The robot.
-        obstacles: The boxes of the world.
+        obstacles: The obstacles.
         q: Joint positions [rad], shape (n, K).
         dq: Joint velocities [rad/s], shape (n, K).
         ddq: Joint accelerations [rad/s^2], shape (n, K).
@@ -61,10 +62,10 @@ class PathWorld:
         self._tip = robot.tip_frame
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
         self._object_size = None if object_size is None else np.array(object_size)
-        self._scene = Scene(obstacles, object_size, 1)
-        self._bodies = None if robot.shape is None else Bodies(robot.shape, obstacles, robot.n)
+        self._scene = Scene(object_size, 1)
+        self._bodies = None if robot.shape is None else Bodies(robot.shape, len(obstacles), robot.n)
         rest = np.zeros((robot.n, 1))
-        self.set_path(robot.base[:, None], rest, rest, np.zeros(len(obstacles)))
+        self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles))
 
     def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
         """Move to K states.
@@ -73,7 +74,7 @@ class PathWorld:
             q: Joint positions [rad], shape (n, K), K > 0.
             dq: Joint velocities [rad/s], shape (n, K).
             ddq: Joint accelerations [rad/s^2], shape (n, K).
-            tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
+            tops: The numbers of the obstacles (``cnpgen.robots.solid``).
             jerk: Joint jerks [rad/s^3], shape (n, K), if they are wanted.
         """
         self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
@@ -82,15 +83,9 @@ class PathWorld:
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
         self._object_distances: list[Array] | None = None
-        self._boxes = [
-            Box(
-                np.array([box.x.low, box.y.low, top - (box.height or ENDLESS)]), np.array([box.x.high, box.y.high, top])
-            )
-            for box, top in zip(self.obstacles, tops.tolist(), strict=True)
-        ]
-        self._tops = tops
-        self._scene.set_tops(tops.tolist())
-        self._move(with_skeleton=bool(self._boxes) and self._bodies is None)
+        self._solids = solids_of(self.obstacles, tops)
+        self._scene.place(self._solids)
+        self._move(with_skeleton=bool(self._solids) and self._bodies is None)
 
     def _move(self, *, with_skeleton: bool) -> None:
         """Run the forward kinematics of every state and keep where the tip is, and the skeleton."""
@@ -152,16 +147,16 @@ class PathWorld:
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
         """
-        segments, boxes = self.segments(), self._boxes
-        ends = [(segment, box) for segment in segments for box in boxes]
+        segments, solids = self.segments(), self._solids
+        ends = [(segment, solid) for segment in segments for solid in solids]
         if not np.all(np.isfinite(segments)):
             return self._unknown(len(ends))
         corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
-        bounds = [gaps(low, high, box) for low, high in corners for box in boxes]
+        bounds = [gaps(low, high, solid) for low, high in corners for solid in solids]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             a, b = ends[pair][0][..., k].tolist()
-            return self._scene.segment_apart(a, b, pair % len(boxes))
+            return self._scene.segment_apart(a, b, pair % len(solids))
 
         every = np.array(bounds).reshape(len(bounds), self.q.shape[1])
         return list(sweep(every, measure, lambda pair, direction: separation(*ends[pair], direction)))
@@ -200,7 +195,7 @@ class PathWorld:
         if not self._placed:
             n = self.robot.n
             rotations, positions = trace(self._model, self._data, self.q, list(range(n + 1)), n_turned=n + 1)
-            self._bodies.place(rotations, positions, self._tops)
+            self._bodies.place(rotations, positions, self._solids)
             self._placed = True
         return self._bodies
 
@@ -215,22 +210,22 @@ class PathWorld:
         """
         if self._object_distances is None:
             self._require_object()
-            finite, count = bool(np.all(np.isfinite(self.tip_position))), len(self._boxes)
+            finite, count = bool(np.all(np.isfinite(self.tip_position))), len(self._solids)
             self._object_distances = list(map(self._object_distance, range(count))) if finite else self._unknown(count)
         return self._object_distances
 
     def _object_distance(self, index: int) -> Array:
         """Measure the signed distance of the held object from one obstacle [m], shape (K,)."""
         position, rotation = self.tip_position, self.tip_rotation
-        size, box = self._require_object(), self._boxes[index]
+        size, solid = self._require_object(), self._solids[index]
 
         def measure(_: int, k: int) -> tuple[float, Array]:
             return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), index)
 
         def separate(_: int, direction: Array) -> Array:
-            return cuboid_separation(position, rotation, size, box, direction)
+            return cuboid_separation(position, rotation, size, solid, direction)
 
-        return np.asarray(sweep(cuboid_gaps(position, rotation, size, box)[None], measure, separate)[0])
+        return np.asarray(sweep(cuboid_gaps(position, rotation, size, solid)[None], measure, separate)[0])
 
     def _require_object(self) -> Array:
         """Return the object's edge lengths [m], shape (3,)."""

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from cnpgen.robots.spec import Obstacle
+from cnpgen.robots.shape.hull import CUBE, frame_along
+from cnpgen.robots.solid import Box, Solid, same_shape
+from cnpgen.world.certified import Body, CertifiedDistance, Pose, body
 
 Array = NDArray[np.float64]
 Point = Sequence[float]
@@ -18,54 +19,53 @@ Point = Sequence[float]
 # 1e-10 of the boxes' size: so much larger Coal makes a box when GJK's direction is parallel to a face.
 GJK_TOLERANCE = 1e-12
 EPA_TOLERANCE = 1e-9
-ENDLESS = 10.0  # m, height of the box that stands for an obstacle without a lower end
+_AXIS = np.array([[0, 0, -0.5], [0, 0, 0.5]])  # ends of a segment of length 1
 
 
 class Scene:
     """The obstacles, the segments of a robot and the held object as Coal shapes.
 
     A segment is a capsule of radius 0, so that Coal's distance is that of the segment itself. GJK is the plain one, not
-    its Nesterov variant, which reports contacts that are none. One process, one thread: shapes are moved in place.
+    its Nesterov variant, which reports contacts that are none. Distances from upright boxes are taken as Coal says
+    them, those from other obstacles are certified. One process, one thread: shapes are moved in place.
 
     Args:
-        obstacles: The boxes of the world.
         object_size: Edge lengths of the held object [m], or None.
         n_segments: Number of the robot's segments.
     """
 
-    def __init__(
-        self, obstacles: "Sequence[Obstacle]", object_size: tuple[float, float, float] | None, n_segments: int
-    ) -> None:
+    def __init__(self, object_size: tuple[float, float, float] | None, n_segments: int) -> None:
         import coal
 
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         self._request.gjk_tolerance, self._request.epa_tolerance = GJK_TOLERANCE, EPA_TOLERANCE
-        self._heights = [float(box.height or ENDLESS) for box in obstacles]
-        self._boxes = [
-            coal.Box(box.x.high - box.x.low, box.y.high - box.y.low, height)
-            for box, height in zip(obstacles, self._heights, strict=True)
-        ]
-        self._middles = [((box.x.low + box.x.high) / 2, (box.y.low + box.y.high) / 2) for box in obstacles]
-        self._places = [coal.Transform3s() for _ in obstacles]
+        self._certified = CertifiedDistance()
         self._capsules = [coal.Capsule(0.0, 1.0) for _ in range(n_segments)]
-        self._object = None if object_size is None else coal.Box(*object_size)
-        self._mover = coal.Transform3s()
-        self._from_capsule = [self._measures(capsule) for capsule in self._capsules]
-        self._from_object = [] if self._object is None else self._measures(self._object)
+        self._object = None if object_size is None else Body(CUBE * np.array(object_size), 0.0, coal.Box(*object_size))
+        self._transform = coal.Transform3s()
+        self._solids, self._bodies, self._places = list[Solid](), list[Body | None](), list[Any]()
+        self._from_capsule, self._from_object = [list[Any]() for _ in self._capsules], list[Any]()
 
-    def _measures(self, shape: Any) -> list[Any]:
+    def place(self, solids: Sequence[Solid]) -> None:
+        """Say where the obstacles are."""
         import coal
 
-        return [coal.ComputeDistance(shape, box) for box in self._boxes]
+        same = len(solids) == len(self._solids) and all(map(same_shape, solids, self._solids))
+        self._solids = list(solids)
+        if not same:
+            self._places = [coal.Transform3s() for _ in solids]
+            self._boxes = [_coal_box(each) if isinstance(each, Box) else None for each in solids]
+            self._bodies = [None if isinstance(each, Box) else body(each.corners, each.radius) for each in solids]
+            self._from_capsule = [self._measures(capsule) for capsule in self._capsules]
+            self._from_object = [] if self._object is None else self._measures(self._object.shape)
+        for place, solid in zip(self._places, solids, strict=True):
+            place.setTranslation(solid.position)
 
-    def set_tops(self, tops: Point) -> None:
-        """Move every obstacle up or down.
+    def _measures(self, shape: Any) -> list[Any]:
+        """Return what measures the distances of a shape; None for obstacles whose distances are to be certified."""
+        import coal
 
-        Args:
-            tops: Heights of the upper faces [m], one per obstacle.
-        """
-        for place, (x, y), height, top in zip(self._places, self._middles, self._heights, tops, strict=True):
-            place.setTranslation(np.array([x, y, top - height / 2]))
+        return [each and coal.ComputeDistance(shape, each) for each in self._boxes]
 
     def segment_distances(self, segments: Sequence[tuple[Point, Point]]) -> list[float]:
         """Measure the signed distance of every segment from every obstacle, segment by segment [m].
@@ -99,8 +99,13 @@ class Scene:
         along = bx - ax, by - ay, bz - az
         length = math.hypot(*along)
         self._capsules[index].halfLength = length / 2
-        self._mover.setRotation(_frame_along(along, length))
-        self._mover.setTranslation(np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2]))
+        pose = frame_along(along, length), np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2])
+        self._place(Body(length * _AXIS, 0.0, self._capsules[index]), pose)
+
+    def _place(self, mover: Body, pose: Pose) -> None:
+        self._mover, self._pose = mover, pose
+        self._transform.setRotation(pose[0])
+        self._transform.setTranslation(pose[1])
 
     def object_distances(self, position: Array, rotation: Array) -> list[float]:
         """Measure the signed distance of the held object from every obstacle [m], minus the depth where they overlap.
@@ -109,8 +114,7 @@ class Scene:
             position: Centre of the object [m], shape (3,).
             rotation: Its rotation matrix, shape (3, 3).
         """
-        self._mover.setRotation(rotation)
-        self._mover.setTranslation(position)
+        self._place_object(position, rotation)
         return self._measure(self._from_object)
 
     def object_apart(self, position: Array, rotation: Array, obstacle: int) -> tuple[float, Array]:
@@ -125,30 +129,32 @@ class Scene:
             The distance [m], minus the depth where they overlap, and the unit vector of shape (3,) along which they are
             apart, from the obstacle to the object.
         """
-        self._mover.setRotation(rotation)
-        self._mover.setTranslation(position)
+        self._place_object(position, rotation)
         return self._apart(self._from_object, obstacle)
 
+    def _place_object(self, position: Array, rotation: Array) -> None:
+        if self._object is not None:
+            self._place(self._object, (rotation, position))
+
     def _apart(self, measures: list[Any], obstacle: int) -> tuple[float, Array]:
-        self._result.clear()
-        distance = measures[obstacle](self._mover, self._places[obstacle], self._request, self._result)
-        return distance, -np.array(self._result.normal)
+        distance = self._distance(measures, obstacle)
+        return distance, self._away if measures[obstacle] is None else -np.array(self._result.normal)
 
     def _measure(self, measures: list[Any]) -> list[float]:
-        """Distances of the shape that ``_mover`` places from every obstacle [m]."""
-        distances = []
-        for measure, place in zip(measures, self._places, strict=True):
-            self._result.clear()  # Coal keeps the smallest distance that a result has seen
-            distances.append(measure(self._mover, place, self._request, self._result))
-        return distances
+        """Distances of what was placed from every obstacle [m]."""
+        return [self._distance(measures, obstacle) for obstacle in range(len(measures))]
+
+    def _distance(self, measures: list[Any], obstacle: int) -> float:
+        measure, still = measures[obstacle], self._bodies[obstacle]
+        if still is not None:
+            at = np.eye(3), self._solids[obstacle].position
+            distance, self._away = self._certified.between(still, at, self._mover, self._pose)
+            return distance
+        self._result.clear()  # Coal keeps the smallest distance that a result has seen
+        return float(measure(self._transform, self._places[obstacle], self._request, self._result))
 
 
-def _frame_along(vector: Point, length: float) -> Array:
-    """Return a rotation matrix whose third column is a vector's direction (Duff et al. 2017, JCGT 6(1))."""
-    if length == 0.0:
-        return np.eye(3)
-    x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
-    sign = math.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])
+def _coal_box(box: Box) -> Any:
+    import coal
+
+    return coal.Box(*np.ptp(box.corners, axis=0))

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.world.bodies import NO_SHAPE, Bodies
 from cnpgen.world.scene import Scene
 
 if TYPE_CHECKING:
+    from cnpgen.robots.obstacle import Obstacle
     from cnpgen.robots.robot import Robot
-    from cnpgen.robots.spec import Obstacle
 
 Array = NDArray[np.float64]
 
@@ -25,12 +26,12 @@ class World:
 
     Args:
         robot: The robot.
-        obstacles: The boxes of the world.
+        obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
 
     Attributes:
         robot: The robot.
-        obstacles: The boxes of the world.
+        obstacles: The obstacles.
         q: Joint positions [rad], shape (n,).
         dq: Joint velocities [rad/s], shape (n,).
         ddq: Joint accelerations [rad/s^2], shape (n,).
@@ -49,12 +50,12 @@ class World:
         self._dynamics_data = self._model.createData()  # RNEA's accelerations include gravity: kept apart
         self._tip = robot.tip_frame
         self._object_size = object_size
-        self._scene = Scene(obstacles, object_size, len(robot.skeleton))
-        self._bodies = None if robot.shape is None else Bodies(robot.shape, obstacles, robot.n)
+        self._scene = Scene(object_size, len(robot.skeleton))
+        self._bodies = None if robot.shape is None else Bodies(robot.shape, len(obstacles), robot.n)
         self._skeleton = robot.skeleton
         self._joints = sorted({point for segment in robot.skeleton for point in segment} - {robot.n})
         zero = np.zeros(robot.n)
-        self.set_state(robot.base, zero, zero, np.zeros(len(obstacles)))
+        self.set_state(robot.base, zero, zero, place_obstacles(obstacles))
 
     def set_state(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
         """Move to a state.
@@ -63,7 +64,7 @@ class World:
             q: Joint positions [rad], shape (n,).
             dq: Joint velocities [rad/s], shape (n,).
             ddq: Joint accelerations [rad/s^2], shape (n,).
-            tops: Heights of the obstacles' upper faces [m], shape (n_obstacles,).
+            tops: The numbers of the obstacles (``cnpgen.robots.solid``).
             jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
         """
         import pinocchio as pin
@@ -71,8 +72,8 @@ class World:
         self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
-        self._scene.set_tops(tops.tolist())
-        self._tops, self._placed = tops, False
+        self._solids, self._placed = solids_of(self.obstacles, tops), False
+        self._scene.place(self._solids)
         self._distances: list[float] | None = None
 
     @property
@@ -171,7 +172,7 @@ class World:
         if not self._placed:
             poses = list(self._data.oMi)
             rotations = np.array([pose.rotation for pose in poses])[..., None]
-            self._bodies.place(rotations, np.array([pose.translation for pose in poses])[..., None], self._tops)
+            self._bodies.place(rotations, np.array([pose.translation for pose in poses])[..., None], self._solids)
             self._placed = True
         return self._bodies
 

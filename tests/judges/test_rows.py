@@ -23,6 +23,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import solids_of
 from cnpgen.world.scene import Scene
 from cnpgen.world.state import World
 
@@ -595,8 +596,8 @@ def test_tops_follow_the_object_or_are_fixed():
 
 
 def test_scene_measures_segments_in_order_and_exactly():
-    scene = Scene(HEAVY.obstacle, None, 3)
-    scene.set_tops([0.5, 0.4])
+    scene = Scene(None, 3)
+    scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
     up = ((0.4, -0.45, 0.6), (0.4, -0.45, 0.9))  # over the first, 0.75 m beside the second
     across = ((0.4, -0.2, 0.2), (0.4, 0.2, 0.2))  # 0.1 m from both
     inside = ((0.3, -0.4, 0.3), (0.5, 0.4, 0.1))
@@ -606,16 +607,16 @@ def test_scene_measures_segments_in_order_and_exactly():
 
 
 def test_scene_measures_a_segment_of_no_length():
-    scene = Scene(HEAVY.obstacle, None, 1)
-    scene.set_tops([0.5, 0.4])
+    scene = Scene(None, 1)
+    scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
     np.testing.assert_allclose(scene.segment_distances([((0.4, 0.0, 0.2),) * 2]), [0.3, 0.3], atol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 2])
 @pytest.mark.parametrize("depth", [-0.1, -1e-9, 0.0, 1e-9, 1e-3, 0.1])
 def test_scene_measures_how_deep_an_object_enters(turn, depth):
-    scene = Scene(HEAVY.obstacle, (0.2, 0.2, 0.3), 0)
-    scene.set_tops([0.5, -3.0])
+    scene = Scene((0.2, 0.2, 0.3), 0)
+    scene.place(solids_of(HEAVY.obstacle, np.array([0.5, -3.0])))
     position, rotation = np.array([0.41, -0.44, 0.65 - depth]), pin.exp3(np.array([0.0, 0.0, turn]))
     assert scene.object_distances(position, rotation)[0] == pytest.approx(-depth, abs=1e-10)
 

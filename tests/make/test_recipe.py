@@ -14,7 +14,8 @@ from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.robots.spec import LimitSpec, Obstacle, RobotSpec
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.trajectory.spec import TrajectorySpec

@@ -5,17 +5,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cnpgen.world.separation import Box, cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.robots.solid import Box
+from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
 
 SIZE = np.array([0.2, 0.2, 0.3])
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def box_between(low: np.ndarray, high: np.ndarray) -> Box:
+    return Box((low + high) / 2, CORNERS * (high - low), low, high)
 
 
 def draw(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, Box]:
     """Poses of a cuboid near a box: from deep inside to far away, upright, tilted a little or at random."""
     random = np.random.default_rng(seed)
     low = random.uniform(-0.3, 0, 3)
-    box = Box(low, low + random.uniform(0.1, 0.6, 3))
+    box = box_between(low, low + random.uniform(0.1, 0.6, 3))
     turn = random.normal(0, 1, (count, 3)) * [0.02, 0.02, 2.0] if seed % 2 else random.normal(0, 3, (count, 3))
     rotation = Rotation.from_rotvec(turn).as_matrix().transpose(1, 2, 0)
     position = (box.low + box.high)[:, None] / 2 + random.normal(0, 0.4, (3, count))
@@ -69,10 +74,10 @@ def test_gaps_along_several_axes_form_a_distance() -> None:
         np.array([[0.3, 0.0, 0.2], [0.4, 0.5, 0.2], [0.0, 0.0, 0.2]]),
         np.array([[1.0] * 3, [1.0] * 3, [1.0] * 3]),
     )
-    box = Box(np.array([-1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
+    box = box_between(np.array([-1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
     np.testing.assert_allclose(gaps(low, high, box), [0.5, 0.5, np.sqrt(0.08)], atol=1e-15)
 
 
 def test_of_what_overlaps_the_shallowest_depth_is_the_bound() -> None:
     low, high = np.array([[0.0], [0.0], [0.9]]), np.array([[1.0], [1.0], [1.5]])
-    assert gaps(low, high, Box(np.zeros(3), np.ones(3)))[0] == pytest.approx(-0.1)
+    assert gaps(low, high, box_between(np.zeros(3), np.ones(3)))[0] == pytest.approx(-0.1)

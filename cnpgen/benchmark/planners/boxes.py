@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import solids_of
 
 Array = NDArray[np.float64]
 Box = tuple[Array, Array]
@@ -25,14 +26,16 @@ def boxes_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> tuple[Array
         goal_xyz: Where it ends [m], shape (3,).
 
     Raises:
-        UsageError: Nothing is held.
+        UsageError: Nothing is held, or an obstacle is no upright box.
     """
     if problem.object_size is None:
         raise UsageError(f"it plans hits on a table and transports, and {problem.name!r} has neither table nor object")
-    tops = obstacle_tops(problem, start_xyz, goal_xyz)
-    low = [np.array([box.x.low, box.y.low, -np.inf]) for box in problem.obstacle]
-    high = [np.array([box.x.high, box.y.high, top]) for box, top in zip(problem.obstacle, tops.tolist(), strict=True)]
-    return np.array(problem.object_size), list(zip(low, high, strict=True))
+    others = [each.name for each in problem.obstacle if not each.upright]
+    if others:
+        raise UsageError(f"it knows upright boxes only, and {problem.name!r} has {', '.join(others)}")
+    solids = solids_of(problem.obstacle, obstacle_tops(problem, start_xyz, goal_xyz))
+    boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in solids]
+    return np.array(problem.object_size), boxes
 
 
 def distance(point: Array, box: Box) -> tuple[float, Array]:

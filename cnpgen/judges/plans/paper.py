@@ -24,6 +24,7 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
+from cnpgen.robots.solid import solids_of
 
 if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem
@@ -87,9 +88,15 @@ def _is_on_table(table: Table, tip: Array) -> bool:
 def _is_clear(problem: "Problem", world: "PathWorld", tops: Array) -> bool:
     size = np.array(problem.object_size or (0.0, 0.0, 0.0))
     centre, reach = world.tip_position, np.linalg.norm(size) / 2
-    for box, top in zip(problem.obstacle, tops, strict=True):
-        low = np.array([box.x.low, box.y.low, -np.inf if box.height is None else top - box.height])[:, None]
-        high = np.array([box.x.high, box.y.high, top])[:, None]
+    measured = world.object_distances() if any(not each.upright for each in problem.obstacle) else []
+    for index, (obstacle, solid) in enumerate(zip(problem.obstacle, solids_of(problem.obstacle, tops), strict=True)):
+        if not obstacle.upright:  # the paper knows upright boxes only
+            if not np.all(measured[index] > -OBJECT):
+                return False
+            continue
+        low, high = solid.low[:, None].copy(), solid.high[:, None]
+        if obstacle.height is None:
+            low[2] = -np.inf
         offset = centre - np.clip(centre, low, high)
         apart = np.sqrt(np.einsum("ik,ik->k", offset, offset))
         near = world.object_corners(apart < reach)  # elsewhere none is inside

@@ -11,6 +11,7 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
@@ -91,7 +92,7 @@ def _along(problem: Problem, robot: Robot, motion: Motion, index: int) -> tuple[
         raise UsageError(f"plan {index} cannot be drawn: its numbers are not finite")
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     jerk = states.jerk[0].T if problem.uses_jerk else None
-    world.set_path(q, dq, ddq, np.zeros(len(problem.obstacle)), jerk)
+    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
     return world, s, t
 
 
@@ -150,17 +151,14 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
 
 def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, tops: Array) -> None:
     """Draw arm, object and obstacles from the side (y-z) and from above (x-y)."""
-    boxes = [
-        ((box.x.low, box.x.high), (box.y.low, box.y.high), (-0.2 if box.height is None else top - box.height, top))
-        for box, top in zip(problem.obstacle, tops, strict=True)
-    ]
+    solids = solids_of(problem.obstacle, tops)
     segments, corners = world.segments(), world.object_corners() if problem.object else None
     colours = [_BETWEEN] * (SHOWN - 2) + [_START, _GOAL]
     moments = np.linspace(0, world.q.shape[1] - 1, SHOWN).round().astype(int)
     moments = np.concatenate([moments[1:-1], moments[[0, -1]]])  # the ends are drawn last, on top
     for axis, (across, up), title in zip(figure.subplots(2, 1), ((1, 2), (1, 0)), ("side", "top"), strict=True):
-        for box in boxes:
-            _draw_rectangle(axis, box[across], box[up], fill=True)
+        for solid in solids:
+            _draw_solid(axis, solid, (across, up))
         for k, colour in zip(moments, colours, strict=True):
             _draw_body(axis, segments[..., k], None if corners is None else corners[..., k], (across, up), colour)
         _draw_course(axis, world.tip_position[across], world.tip_position[up])
@@ -191,6 +189,18 @@ def _draw_course(axis: "Axes", a: Array, b: Array) -> None:
     axis.plot(a[0], b[0], "o", color=_START, label="start")
     axis.plot(a[-1], b[-1], "s", color=_GOAL, label="goal")
     axis.legend(fontsize=8, loc="best")
+
+
+def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
+    """Draw the shadow of an obstacle."""
+    from matplotlib.patches import Polygon
+
+    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    round_it = solid.radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    shadow = (solid.position + solid.corners)[:, None, list(plane)] + round_it
+    outline = _hull(shadow.reshape(-1, 2))
+    axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
+    axis.update_datalim(outline)
 
 
 def _draw_rectangle(axis: "Axes", across: tuple[float, float], up: tuple[float, float], *, fill: bool) -> None:

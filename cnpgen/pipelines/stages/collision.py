@@ -1,8 +1,8 @@
-"""Stage: collisions of the arm and the held object with the boxes of the world, judged by Coal on both ends.
+"""Stage: collisions of the arm and the held object with the obstacles, judged by Coal on both ends.
 
-An exact test of every capsule's segment against every box comes first and rejects almost all collisions cheaply; Coal
-then judges every sample that is left. The boxes move with the sample, so each becomes a sliding joint of the
-Pinocchio model: one call checks a whole round without any Python per sample.
+A test of every capsule's segment against every obstacle comes first, exact for boxes, and rejects almost all collisions
+cheaply; Coal then judges every sample that is left. Obstacles may move with the sample, so each becomes a sliding joint
+of the Pinocchio model: one call checks a whole round without any Python per sample.
 
 A robot with a shape is covered by its capsules: samples whose capsules are clear are kept, of all others Coal decides
 with the convex pieces of the links.
@@ -22,15 +22,14 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
+from cnpgen.robots.solid import Box, Solid, count_numbers, height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.boxes import segment_box_distance
+from cnpgen.symbolic.solids import symbolic_solids
 from cnpgen.symbolic.state import SymbolicState, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
-
-DEEP = 10.0  # m: height of the box that stands for an obstacle without a lower end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,13 +125,13 @@ def skeleton_distance(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, tops) -> smallest distance of a segment of the skeleton from an obstacle`` [m]."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
     zero = [0.0] * robot.n
     state = SymbolicState(robot, q, zero, zero, tops, problem.obstacle, None)
     nearest = ca.SX(np.inf)
     for first, second in state.segments:
-        for box in state.boxes:
-            nearest = ca.fmin(nearest, segment_box_distance(first, second, box))
+        for solid in symbolic_solids(state):
+            nearest = ca.fmin(nearest, solid.distance(first, second))
     return ca.Function("skeleton_distance", [q_sx, tops_sx], [nearest])
 
 
@@ -140,14 +139,14 @@ def capsule_clearance(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, tops) -> smallest distance of a link's capsule from an obstacle`` [m], minus the radius at most."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", len(problem.obstacle))
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
     zero = [0.0] * robot.n
     state = SymbolicState(robot, q, zero, zero, tops, problem.obstacle, None)
     moving = robot.shape.moving_capsules if robot.shape else ()
     nearest = ca.SX(np.inf)
     for first, second, radius in (state.capsules[capsule.link] for capsule in moving):
-        for box in state.boxes:
-            nearest = ca.fmin(nearest, segment_box_distance(first, second, box) - radius)
+        for solid in symbolic_solids(state):
+            nearest = ca.fmin(nearest, solid.distance(first, second) - radius)
     return ca.Function("capsule_clearance", [q_sx, tops_sx], [nearest])
 
 
@@ -169,22 +168,33 @@ def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) ->
         frame = model.frames[robot.tip_frame]
         box = pin.GeometryObject("object", frame.parentJoint, 0, frame.placement, coal.Box(*size))
         moving.append(geometry.addGeometryObject(box))
-    for index, obstacle in enumerate(problem.obstacle):
-        height = DEEP if obstacle.height is None else obstacle.height
-        centre = np.array([(obstacle.x.low + obstacle.x.high) / 2, (obstacle.y.low + obstacle.y.high) / 2, 0.0])
-        slide = model.addJoint(0, pin.JointModelPZ(), pin.SE3(np.eye(3), centre), f"obstacle_{index}")
-        shape = coal.Box(obstacle.x.high - obstacle.x.low, obstacle.y.high - obstacle.y.low, height)
-        below = pin.SE3(np.eye(3), np.array([0.0, 0.0, -height / 2]))
-        added = geometry.addGeometryObject(pin.GeometryObject(obstacle.name, slide, 0, below, shape))
+    numbers, heights = place_obstacles(problem.obstacle), height_places(problem.obstacle)
+    numbers[heights] = 0.0
+    solids = solids_of(problem.obstacle, numbers)
+    for index, (obstacle, solid) in enumerate(zip(problem.obstacle, solids, strict=True)):
+        x, y, z = solid.position
+        slide = model.addJoint(0, pin.JointModelPZ(), pin.SE3(np.eye(3), np.array([x, y, 0.0])), f"obstacle_{index}")
+        below = pin.SE3(np.eye(3), np.array([0.0, 0.0, z]))
+        added = geometry.addGeometryObject(pin.GeometryObject(obstacle.name, slide, 0, below, _coal_shape(solid)))
         for body in moving:
             geometry.addCollisionPair(pin.CollisionPair(body, added))
     pool = pin.GeometryPool(model, geometry, 1)
 
     def judge(q: Array, tops: Array) -> NDArray[np.bool_]:
-        states = np.asfortranarray(np.concatenate([q, tops]))
+        states = np.asfortranarray(np.concatenate([q, tops[heights]]))
         return np.asarray(pin.computeCollisionsInParallel(1, pool, states, True)).astype(bool)
 
     return judge
+
+
+def _coal_shape(solid: Solid) -> Any:
+    import coal
+
+    if isinstance(solid, Box):
+        return coal.Box(*np.ptp(solid.corners, axis=0))
+    hull = coal_hull(solid.corners)
+    hull.setSweptSphereRadius(solid.radius)
+    return hull
 
 
 def _add_pieces(geometry: Any, shape: Shape, distance: float) -> list[int]:

@@ -9,6 +9,9 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cnpgen.robots.obstacle import Obstacle
     from cnpgen.symbolic.state import SymbolicState
     from cnpgen.world.state import World
 
@@ -32,19 +35,19 @@ class RobotClearance(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the signed distance of every moving segment, or capsule's axis, from every obstacle [m]."""
-        from cnpgen.symbolic.boxes import segment_box_separation
+        from cnpgen.symbolic.solids import symbolic_solids
 
-        segments, radii = self._capsules(state)
-        distances = [segment_box_separation(a, b, box) for a, b in segments for box in state.boxes]
-        return self._clear(distances, radii, sufficient=state.robot.shape is not None)
+        (segments, radii), solids = self._capsules(state), symbolic_solids(state)
+        distances = [solid.separation(a, b) for a, b in segments for solid in solids]
+        return self._clear(distances, radii, sufficient=_is_cautious(state))
 
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State distances that are easier to descend: inside, the depth of the middle of what is inside [m]."""
-        from cnpgen.symbolic.boxes import signed_segment_box_distance as distance
+        from cnpgen.symbolic.solids import symbolic_solids
 
-        segments, radii = self._capsules(state)
-        distances = [distance(a, b, box, hold=state.hold) for a, b in segments for box in state.boxes]
-        return self._clear(distances, radii, sufficient=state.robot.shape is not None)
+        (segments, radii), solids = self._capsules(state), symbolic_solids(state)
+        distances = [solid.descent(a, b, state.hold) for a, b in segments for solid in solids]
+        return self._clear(distances, radii, sufficient=_is_cautious(state))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
@@ -59,11 +62,11 @@ class RobotClearance(Constraint):
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
-        shape = world.robot.shape
-        if shape is None:
+        shape, skeleton = world.robot.shape, world.robot.skeleton
+        if shape is None and not _has_poses(world.obstacles):
             return self.measured(world)
-        radii = [capsule.radius for capsule in shape.moving_capsules]
-        return self._clear([0.0] * (len(radii) * len(world.obstacles)), radii, sufficient=True)
+        capsules = [self.radius or 0.0] * len(skeleton) if shape is None else [c.radius for c in shape.moving_capsules]
+        return self._clear([0.0] * (len(capsules) * len(world.obstacles)), capsules, sufficient=True)
 
     def _capsules(self, state: "SymbolicState") -> tuple[list[Any], list[float]]:
         """Both ends of the axes of all moving capsules, and their radii [m]."""
@@ -92,15 +95,31 @@ class ObjectContact(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the separation of the object from every obstacle [m]."""
-        from cnpgen.symbolic.boxes import upright_box_separation
+        from cnpgen.symbolic.solids import symbolic_solids
 
-        kin, size = state.kinematics, state.object_size or (0.0, 0.0, 0.0)
-        return self._shallow([upright_box_separation(kin.tip, kin.rotation, size, box) for box in state.boxes])
+        kin, size, solids = state.kinematics, state.object_size or (0.0, 0.0, 0.0), symbolic_solids(state)
+        distances = [solid.cuboid_separation(kin.tip, kin.rotation, size) for solid in solids]
+        return self._shallow(distances, sufficient=_has_poses(state.obstacles))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
         return self._shallow(world.object_distances())
 
-    def _shallow(self, distances: list[Any]) -> tuple[Condition, ...]:
+    def solved(self, world: "World") -> tuple[Condition, ...]:
+        """Return the conditions of what solvers see of the obstacles."""
+        return self._shallow([0.0] * len(world.obstacles), sufficient=_has_poses(world.obstacles))
+
+    def _shallow(self, distances: list[Any], *, sufficient: bool = False) -> tuple[Condition, ...]:
         m = len(distances)
-        return (Condition("object contact", "m", distances, np.full(m, -self.depth), np.full(m, np.inf), "position"),)
+        least, most = np.full(m, -self.depth), np.full(m, np.inf)
+        return (Condition("object contact", "m", distances, least, most, "position", sufficient=sufficient),)
+
+
+def _is_cautious(state: "SymbolicState") -> bool:
+    """Whether solvers may see the robot nearer to an obstacle than it is."""
+    return state.robot.shape is not None or _has_poses(state.obstacles)
+
+
+def _has_poses(obstacles: "Sequence[Obstacle]") -> bool:
+    """Whether an obstacle is none of those that solvers and judges see alike."""
+    return not all(each.upright for each in obstacles)

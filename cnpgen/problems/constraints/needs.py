@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.robots.solid import place_obstacles
 
 if TYPE_CHECKING:
     from cnpgen.world.state import World
@@ -62,7 +63,7 @@ def _changed(
     forms: "Sequence[Callable[[World], Iterable[Condition]]]", world: "World", states: Sequence[Sequence[Array]]
 ) -> list[bool]:
     """Say which conditions have another value at one of the states than at rest; the world is left at rest."""
-    tops, rest = np.zeros(len(world.obstacles)), [np.zeros(world.robot.n) for _ in states[0]]
+    tops, rest = place_obstacles(world.obstacles), [np.zeros(world.robot.n) for _ in states[0]]
 
     def values(dq: Array, ddq: Array, jerk: Array | None = None) -> list[Array]:
         world.set_state(world.robot.base, dq, ddq, tops, jerk)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.state import SymbolicState, jerk_along, symbols
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
 
 def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
     n, orders = robot.n, problem.path_orders
-    (w_sx, w), (tops_sx, tops) = symbols("w", orders * n + orders - 1), symbols("tops", len(problem.obstacle))
+    (w_sx, w), (tops_sx, tops) = symbols("w", orders * n + orders - 1), symbols("tops", count_numbers(problem.obstacle))
     p, *path = (w[order * n : (order + 1) * n] for order in range(orders))
     (p1, p2), rate = path[:2], w[orders * n :]
     r, r1 = rate[:2]

@@ -1,5 +1,7 @@
 """Convex hulls: the corners of one, and one as Coal takes it."""
 
+import math
+from collections.abc import Sequence
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # the corners of a cube of edge length 1 round the origin
+MOST_PLANES = 24  # that stand for the faces of a hull
+NEAR = math.cos(math.radians(3))  # of the angle between planes that are as good as one
 THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
 
 
@@ -33,6 +37,29 @@ def hull_corners(points: Array) -> Array:
             points = np.concatenate([points - THINNEST * axis, points + THINNEST * axis])
     corners: Array = points[np.sort(ConvexHull(points).vertices)]
     return corners
+
+
+def supporting_planes(corners: Array) -> Array:
+    """Return planes that a convex hull is behind, few but looking to all sides, shape (P, 4).
+
+    They are the hull's own faces, each time the one that looks furthest away from those taken before and from the axes.
+
+    Args:
+        corners: The corners of the hull [m], shape (V, 3).
+
+    Returns:
+        Outer unit normals and offsets [m]: ``normal @ x <= offset`` for all points of the hull.
+    """
+    from scipy.spatial import ConvexHull
+
+    normals: Array = ConvexHull(corners).equations[:, :3]
+    nearest = np.abs(normals).max(axis=1)  # cosine of the angle to the nearest axis
+    taken: list[Array] = []
+    while len(taken) < MOST_PLANES and nearest.min() < NEAR:
+        taken.append(normals[np.argmin(nearest)])
+        nearest = np.maximum(nearest, normals @ taken[-1])
+    found = np.array(taken).reshape(-1, 3)
+    return np.column_stack([found, (found @ corners.T).max(axis=1)])
 
 
 def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
@@ -62,3 +89,14 @@ def coal_hull(corners: Array) -> "coal.Convex":
     for triangle in triangles:
         faces.append(coal.Triangle(*map(int, triangle)))
     return coal.Convex(points, faces)
+
+
+def frame_along(vector: Sequence[float], length: float) -> Array:
+    """Return a rotation matrix whose third column is a vector's direction (Duff et al. 2017, JCGT 6(1))."""
+    if length == 0.0:
+        return np.eye(3)
+    x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])

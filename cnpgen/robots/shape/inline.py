@@ -37,15 +37,15 @@ def with_inline_meshes(urdf: str, path: Path, packages: Sequence[Path] = ()) -> 
         tree = urdf_tree(urdf)
     except ValueError:  # whoever reads the robot says so
         return urdf
-    meshes = [mesh for mesh in tree.iterfind(".//collision/geometry/mesh") if not _is_inline(mesh)]
+    meshes = [mesh for mesh in tree.iterfind(".//collision/geometry/mesh") if not is_inline(mesh.get("filename", ""))]
     mistakes: list[str] = []
     for mesh in meshes:
         try:
-            corners = _hull_of_file(find_named_file(mesh.get("filename", ""), path, packages), _scale(mesh))
+            address = inline_mesh(find_named_file(mesh.get("filename", ""), path, packages), _scale(mesh))
         except RecipeError as error:
             mistakes += error.mistakes
         else:
-            mesh.set("filename", _INLINE + base64.b64encode(corners.astype("<f8").tobytes()).decode())
+            mesh.set("filename", address)
             mesh.attrib.pop("scale", None)
     if mistakes:
         raise RecipeError(list(dict.fromkeys(mistakes)))
@@ -61,14 +61,45 @@ def points_of(mesh: ElementTree.Element) -> Array:
     Raises:
         ValueError: It is not inline.
     """
-    if not _is_inline(mesh):
-        raise ValueError(f"the mesh {mesh.get('filename', '')!r} is not in the text of the URDF")
-    content = base64.b64decode(mesh.get("filename", "").removeprefix(_INLINE))
-    return np.frombuffer(content, "<f8").reshape(-1, 3).astype(float)
+    name = mesh.get("filename", "")
+    if not is_inline(name):
+        raise ValueError(f"the mesh {name!r} is not in the text of the URDF")
+    return corners_of(name)
 
 
-def _is_inline(mesh: ElementTree.Element) -> bool:
-    return mesh.get("filename", "").startswith(_INLINE)
+def inline_mesh(path: Path, scale: Array) -> str:
+    """Return the corners of the convex hull of a mesh file as a ``data:`` address.
+
+    Args:
+        path: The file.
+        scale: Factors of x, y, z, shape (3,).
+
+    Raises:
+        RecipeError: It cannot be read.
+    """
+    return address_of(_hull_of_file(path, scale))
+
+
+def address_of(corners: Array) -> str:
+    """Return corners [m], shape (V, 3), as a ``data:`` address."""
+    return _INLINE + base64.b64encode(corners.astype("<f8").tobytes()).decode()
+
+
+def is_inline(address: str) -> bool:
+    """Whether a mesh is given by its corners, not by the name of a file."""
+    return address.startswith(_INLINE)
+
+
+def corners_of(address: str) -> Array:
+    """Return the corners of an inline mesh [m], shape (V, 3).
+
+    Raises:
+        ValueError: They are no finite numbers, three per corner.
+    """
+    corners = np.frombuffer(base64.b64decode(address.removeprefix(_INLINE)), "<f8").reshape(-1, 3).astype(float)
+    if not len(corners) or not np.isfinite(corners).all():
+        raise ValueError("a mesh has no corners, or some that are not finite")
+    return corners
 
 
 def _scale(mesh: ElementTree.Element) -> Array:

@@ -1,7 +1,6 @@
 """Convex pieces of links: the hull of a few points, thickened by a radius, as the elements of a URDF describe them."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
@@ -93,14 +92,18 @@ def _core(shape: ElementTree.Element) -> tuple[Array, float]:
     half = _positive(_numbers(shape, "length", 1)[0]) / 2
     if shape.tag == "capsule":
         return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), radius
-    return np.array([[x, y, z] for z in (-half, half) for x, y in _circle(radius)]), 0.0
+    return prism(radius / math.cos(math.pi / SIDES), half), 0.0
 
 
-def _circle(radius: float) -> Iterator[tuple[float, float]]:
-    """Corners of the regular polygon whose sides touch a circle."""
-    outer = radius / math.cos(math.pi / SIDES)
-    for angle in np.arange(SIDES) * (2 * math.pi / SIDES):
-        yield outer * math.cos(angle), outer * math.sin(angle)
+def prism(outer: float, half: float) -> Array:
+    """Return the corners of a prism of ``SIDES`` sides along z [m], shape (2 SIDES, 3).
+
+    Args:
+        outer: How far they are from its axis [m].
+        half: Half its length [m].
+    """
+    circle = [(outer * math.cos(a), outer * math.sin(a)) for a in np.arange(SIDES) * (2 * math.pi / SIDES)]
+    return np.array([[x, y, z] for z in (-half, half) for x, y in circle])
 
 
 def _origin(element: ElementTree.Element | None) -> tuple[Array, Array]:

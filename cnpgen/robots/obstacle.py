@@ -1,0 +1,121 @@
+"""The obstacles of a problem, as its file says them."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from cnpgen.robots.shape.inline import corners_of, is_inline
+from cnpgen.schema.keys import Range, field
+
+_KEYS = {  # kind -> the keys that say where and how large it is; those of _OPTIONAL may be left out
+    "box": ("position", "size", "rotation"),
+    "sphere": ("position", "radius"),
+    "cylinder": ("position", "radius", "length", "rotation"),
+    "capsule": ("position", "radius", "length", "rotation"),
+    "mesh": ("position", "mesh", "rotation", "scale"),
+}
+_UPRIGHT = ("x", "y", "top", "height")  # those of an upright box
+_OPTIONAL = {"rotation": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """A convex body that stands still: an upright box given by ranges, or one of several kinds with a pose.
+
+    With ``below`` its highest point touches the bottom of the object at that end of the motion; the z of a
+    ``position`` then says how much higher it is.
+    """
+
+    name: str = field("name of the obstacle")
+    x: Range | None = field("extent of an upright box along world x", unit="m", default=None)
+    y: Range | None = field("extent of an upright box along world y", unit="m", default=None)
+    height: float | None = field(
+        "height of the upright box, measured down from its top; none: it extends down without end",
+        unit="m",
+        default=None,
+        low=1e-6,
+    )
+    top: float | None = field("height of its upper face", unit="m", default=None)
+    below: str = field("the end whose object stands on this obstacle", choices=("", "start", "goal"), default="")
+    kind: str = field("what it is", choices=tuple(_KEYS), default="box", late=True)
+    position: tuple[float, float, float] | None = field(
+        "where its centre is, of a mesh the origin of its file: x, y, z", unit="m", default=None, late=True
+    )
+    rotation: tuple[float, float, float] = field(
+        "how it is turned: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
+        unit="rad",
+        default=_OPTIONAL["rotation"],
+        late=True,
+    )
+    size: tuple[float, float, float] | None = field(
+        "edge lengths of a box", unit="m", default=None, low=1e-6, late=True
+    )
+    radius: float | None = field(
+        "radius of a sphere, a cylinder, a capsule", unit="m", default=None, low=1e-6, late=True
+    )
+    length: float | None = field(
+        "length of a cylinder or, without its round ends, of a capsule; both lie along their z axis",
+        unit="m",
+        default=None,
+        low=1e-6,
+        late=True,
+    )
+    mesh: str = field(
+        "mesh file (STL, DAE, OBJ), relative to the problem file, of which the convex hull counts",
+        default="",
+        late=True,
+    )
+    scale: tuple[float, float, float] = field("factors of the mesh's x, y and z", default=_OPTIONAL["scale"], late=True)
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        if self.upright:
+            yield from self._mistakes_upright()
+        else:
+            yield from self._mistakes_posed()
+
+    @property
+    def upright(self) -> bool:
+        """Whether it is an upright box given by ranges along the world's axes."""
+        return self.kind == "box" and (self.x is not None or self.y is not None)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether its axes are not the world's."""
+        return self.rotation != _OPTIONAL["rotation"]
+
+    def _mistakes_upright(self) -> Iterator[tuple[str, str]]:
+        if self.top is None and not self.below:
+            yield "top", f"obstacle {self.name!r} has no height: expected a 'top', or 'below' = \"start\" or \"goal\""
+        if self.top is not None and self.below:
+            yield "top", f"obstacle {self.name!r} has both a 'top' and a 'below', expected one of them"
+        for key, extent in (("x", self.x), ("y", self.y)):
+            if extent is None:
+                yield key, f"obstacle {self.name!r} is an upright box and needs its extent here"
+            elif extent.low == extent.high:
+                yield key, f"obstacle {self.name!r} has no extent here, expected a low end below the high end"
+        for key in self._given(set().union(*_KEYS.values())):
+            yield key, f"an upright box has {_listed(_UPRIGHT)}: leave this out, or give a box with a pose"
+
+    def _mistakes_posed(self) -> Iterator[tuple[str, str]]:
+        known = _KEYS[self.kind]
+        needed = [key for key in known if key not in _OPTIONAL]
+        instead = f", or {_listed(_UPRIGHT)} in their place" if self.kind == "box" else ""
+        for key in sorted(set(needed) - set(self._given(needed))):
+            yield key, f"obstacle {self.name!r} is a {self.kind} and needs {_listed(needed)}{instead}"
+        for key in self._given(set(_UPRIGHT).union(*_KEYS.values()) - set(known)):
+            yield key, f"a {self.kind} has no such key, expected {_listed(known)}"
+        if 0.0 in self.scale:
+            yield "scale", f"factors must not be 0, got {list(self.scale)}"
+        if is_inline(self.mesh):
+            try:
+                corners_of(self.mesh)
+            except ValueError as error:
+                yield "mesh", str(error)
+
+    def _given(self, keys: Iterable[str]) -> list[str]:
+        """List those of some keys that are given."""
+        return [key for key in sorted(keys) if getattr(self, key) not in (None, "", _OPTIONAL.get(key))]
+
+
+def _listed(keys: Sequence[str]) -> str:
+    return f"{', '.join(map(repr, keys[:-1]))} and {keys[-1]!r}"

@@ -1,0 +1,166 @@
+"""Obstacles as bodies, and the numbers that say where they are and how large.
+
+The numbers are what kernels and judges are told of obstacles, sample by sample. Those of one obstacle are, all in m,
+
+* of an upright box given by ``x`` and ``y``: the height of its upper face;
+* of any other: its position, then
+  box: half its edge lengths, and the rows of its rotation matrix if it is turned;
+  sphere: its radius;
+  capsule, cylinder: the vector from its centre to the end of its axis, and its radius (of a cylinder that of the
+  corners of the prism round it);
+  mesh: the rows of its rotation matrix.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.hull import CUBE, frame_along
+from cnpgen.robots.shape.inline import corners_of
+from cnpgen.robots.shape.piece import SIDES, prism, turned
+from cnpgen.schema.keys import Range
+
+Array = NDArray[np.float64]
+
+ENDLESS = 10.0  # m: height of the box that stands for an obstacle without a lower end
+_NOTHING = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex body where it stands: all points within ``radius`` of the hull of ``corners`` moved by ``position``.
+
+    Attributes:
+        position: Where it is [m], shape (3,).
+        corners: Corners of the hull from there, along the world's axes [m], shape (V, 3).
+        low: Its lowest coordinates [m], shape (3,).
+        high: Its highest coordinates [m], shape (3,).
+        radius: How thick the hull is wrapped [m].
+    """
+
+    position: Array
+    corners: Array
+    low: Array
+    high: Array
+    radius: float = 0.0
+
+    def furthest(self, direction: Array) -> float:
+        """How far it reaches along a unit vector of shape (3,), from the world's origin [m]."""
+        return float(self.position @ direction + (self.corners @ direction).max() + self.radius)
+
+
+class Box(Solid):
+    """A box along the world's axes."""
+
+    def furthest(self, direction: Array) -> float:
+        """Likewise."""
+        return float(np.where(direction > 0, self.high, self.low) @ direction)
+
+
+def same_shape(a: Solid, b: Solid) -> bool:
+    """Whether two bodies differ at most in where they are."""
+    return type(a) is type(b) and a.radius == b.radius and np.array_equal(a.corners, b.corners)
+
+
+def count_numbers(obstacles: Sequence[Obstacle]) -> int:
+    """How many numbers say where obstacles are and how large."""
+    return sum(map(_count, obstacles))
+
+
+def number_slices(obstacles: Sequence[Obstacle]) -> list[slice]:
+    """Say which of the numbers are those of each obstacle."""
+    ends = np.cumsum([0, *map(_count, obstacles)]).tolist()
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def height_places(obstacles: Sequence[Obstacle]) -> list[int]:
+    """Say which of the numbers is the height of each obstacle."""
+    parts = number_slices(obstacles)
+    return [part.start + (0 if each.upright else 2) for each, part in zip(obstacles, parts, strict=True)]
+
+
+def _count(obstacle: Obstacle) -> int:
+    if obstacle.upright:
+        return 1
+    turn = 9 if obstacle.is_turned else 0
+    return 3 + {"box": 3 + turn, "sphere": 1, "capsule": 4, "cylinder": 4, "mesh": 9}[obstacle.kind]
+
+
+def place_obstacles(obstacles: Sequence[Obstacle], bottoms: Mapping[str, Array] | None = None) -> Array:
+    """Compute the numbers of obstacles, shape (..., count_numbers).
+
+    Args:
+        obstacles: The obstacles.
+        bottoms: Height of the object's bottom [m] at "start" and "goal", arrays of shape (...); by default 0.
+    """
+    bottoms = bottoms or {"start": np.zeros(()), "goal": np.zeros(())}
+    numbers = np.empty((*bottoms["start"].shape, count_numbers(obstacles)))
+    for obstacle, part in zip(obstacles, number_slices(obstacles), strict=True):
+        if obstacle.upright:
+            numbers[..., part.start] = bottoms[obstacle.below] if obstacle.top is None else obstacle.top
+            continue
+        still = _posed_numbers(obstacle)
+        numbers[..., part] = still
+        if obstacle.below:
+            numbers[..., part.start + 2] += bottoms[obstacle.below] - (_solid(obstacle, still).high[2] - still[2])
+    return numbers
+
+
+def _posed_numbers(obstacle: Obstacle) -> Array:
+    """Return the numbers of an obstacle with a pose, as its keys say."""
+    turn, radius, half = turned(*obstacle.rotation), obstacle.radius or 0.0, (obstacle.length or 0.0) / 2
+    edges = np.array(obstacle.size or _NOTHING) / 2
+    by_kind: dict[str, Sequence[float]] = {
+        "box": [*edges, *(turn.ravel() if obstacle.is_turned else ())],
+        "sphere": [radius],
+        "capsule": [*(half * turn[:, 2]), radius],
+        "cylinder": [*(half * turn[:, 2]), radius / math.cos(math.pi / SIDES)],
+        "mesh": [*turn.ravel()],
+    }
+    return np.array([*(obstacle.position or _NOTHING), *by_kind[obstacle.kind]])
+
+
+def solids_of(obstacles: Sequence[Obstacle], numbers: Array) -> list[Solid]:
+    """Return the bodies that obstacles are.
+
+    Args:
+        obstacles: The obstacles.
+        numbers: Their numbers, shape (count_numbers,).
+    """
+    return [_solid(each, numbers[part]) for each, part in zip(obstacles, number_slices(obstacles), strict=True)]
+
+
+def _solid(obstacle: Obstacle, numbers: Array) -> Solid:
+    """Return the body that an obstacle is; a cylinder is the prism of ``SIDES`` sides round it."""
+    if obstacle.upright:
+        return _upright_box(obstacle, float(numbers[0]))
+    position, rest = numbers[:3], numbers[3:]
+    if obstacle.kind == "box":
+        corners = 2 * CUBE * rest[:3]
+        return _wrapped(position, corners @ rest[3:].reshape(3, 3).T if obstacle.is_turned else corners)
+    if obstacle.kind == "sphere":
+        return _wrapped(position, np.zeros((1, 3)), float(rest[0]))
+    if obstacle.kind == "capsule":
+        return _wrapped(position, np.array([-rest[:3], rest[:3]]), float(rest[3]))
+    if obstacle.kind == "mesh":
+        return _wrapped(position, corners_of(obstacle.mesh) @ rest.reshape(3, 3).T)
+    half = float(np.linalg.norm(rest[:3]))
+    return _wrapped(position, prism(float(rest[3]), half) @ frame_along(rest[:3].tolist(), half).T)
+
+
+def _wrapped(position: Array, corners: Array, radius: float = 0.0) -> Solid:
+    low, high = position + corners.min(axis=0) - radius, position + corners.max(axis=0) + radius
+    return Solid(position, corners, low, high, radius)
+
+
+def _upright_box(obstacle: Obstacle, top: float) -> Box:
+    x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
+    height = obstacle.height or ENDLESS
+    middle = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
+    corners = CUBE * np.array([x.high - x.low, y.high - y.low, height])
+    return Box(middle, corners, np.array([x.low, y.low, top - height]), np.array([x.high, y.high, top]))
