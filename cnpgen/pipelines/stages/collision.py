@@ -37,7 +37,7 @@ DEEP = 10.0  # m: height of the box that stands for an obstacle without a lower 
 class Collision(Stage):
     """Rejects configurations where the arm or the object enters an obstacle."""
 
-    end: str = field("which end", choices=("start", "goal", "both"))
+    end: str = field("which end is looked at", choices=("start", "goal", "both"))
     judge: str = field("what decides: the exact segment test alone, or Coal after it", choices=("segments", "coal"))
 
     @property
