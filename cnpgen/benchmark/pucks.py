@@ -30,12 +30,12 @@ State = tuple[Array, Array, Array]
 class Pucks:
     """A grid of pucks, each hit as fast as the arm can."""
 
-    problem: Problem = field("the problem", form="name or path of a problem")
+    problem: Problem = field("the problem, which has a table", form="name or path of a problem")
     x: Range = field("where the pucks lie along world x, both ends included", unit="m")
-    y: Range = field("and along world y", unit="m")
-    columns: int = field("how many different x", low=1)
-    rows: int = field("how many different y", low=1)
-    goal: tuple[float, float] = field("where they are sent", unit="m")
+    y: Range = field("where they lie along world y, both ends included", unit="m")
+    columns: int = field("how many columns of pucks, evenly spaced along x", low=1)
+    rows: int = field("how many rows of pucks, evenly spaced along y", low=1)
+    goal: tuple[float, float] = field("where they are sent: x, y", unit="m")
     behind: float = field("where the tip is when it hits: so far behind the puck's centre", unit="m", low=0.0)
 
     def positions(self) -> Array:

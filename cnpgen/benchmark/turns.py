@@ -26,7 +26,7 @@ class Turns:
     """Turns from every puck of a grid to the opposite one, at some moments of the first motion."""
 
     when: tuple[float, ...] = field("when the arm leaves its first motion", unit="s", low=0.0)
-    pucks: Pucks = field("the grid")
+    pucks: Pucks = field("the grid of pucks that the arm sets out for, and turns to")
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""

@@ -122,7 +122,8 @@ def _text(found: "Benchmark") -> str:
 def _listing(*, as_json: bool) -> str:
     """List what there is to compare, and on what."""
     from cnpgen.benchmark.suite import list_suites, load_suite
-    from cnpgen.cli.describe import kind_summary, table
+    from cnpgen.cli.describe import table
+    from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.schema import registry
     from cnpgen.simulator.plant import PLANTS
 

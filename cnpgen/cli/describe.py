@@ -1,6 +1,5 @@
 """Recipes in words and numbers: what ``cnpgen show`` prints."""
 
-import dataclasses
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
-from cnpgen.schema.keys import Key, PerJoint, Range, keys
+from cnpgen.schema.keys import PerJoint, Range, keys
 
 WIDTH = 100
 
@@ -54,7 +53,9 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
         ("recipe", f"sha256 {recipe_digest(recipe)}"),
         ("file", recipe.path),
     ]
-    return "\n".join([f"dataset {recipe.name} {recipe.version}", *_title(recipe.title), *table(facts, indent="  ")])
+    return "\n".join(
+        [f"dataset {recipe.name} {recipe.version}", *title_lines(recipe.title), *table(facts, indent="  ")]
+    )
 
 
 def describe_pipeline(pipeline: Pipeline) -> str:
@@ -63,7 +64,7 @@ def describe_pipeline(pipeline: Pipeline) -> str:
     steps.append(
         ("", "(always)", "reject what does not meet every constraint exactly, on the numbers as they are stored")
     )
-    return "\n".join([f"pipeline {pipeline.name}", *_title(pipeline.title), *table(steps, indent="  ")])
+    return "\n".join([f"pipeline {pipeline.name}", *title_lines(pipeline.title), *table(steps, indent="  ")])
 
 
 def describe_problem(problem: Problem) -> str:
@@ -85,7 +86,7 @@ def describe_problem(problem: Problem) -> str:
     return "\n".join(
         [
             f"problem {problem.name}",
-            *_title(problem.title),
+            *title_lines(problem.title),
             *table(facts, indent="  "),
             "",
             "  planning limits",
@@ -130,7 +131,8 @@ def _jerk_limits(robot: Robot) -> str:
     return f"    jerk [rad/s^3], joint by joint: {', '.join(f'{x:.4g}' for x in robot.jerk_limit)}"
 
 
-def _title(title: str) -> list[str]:
+def title_lines(title: str) -> list[str]:
+    """Wrap what a recipe or a kind is, as lines below its name."""
     return textwrap.wrap(title, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
 
 
@@ -170,63 +172,6 @@ def kind_name(item: Stage | Constraint) -> str:
     """Return the name under which the kind of a stage or constraint is registered."""
     group = registry.STAGES if isinstance(item, Stage) else registry.CONSTRAINTS
     return registry.name_of(group, type(item))
-
-
-def kind_summary(kind: type) -> str:
-    """Return the first line of a kind's documentation, without markup."""
-    return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "")
-
-
-def describe_kind(group: str, name: str) -> str:
-    """Describe a kind of stage or constraint: what it does, and the keys of its table.
-
-    Args:
-        group: ``registry.STAGES`` or ``registry.CONSTRAINTS``.
-        name: Name of the kind.
-
-    Raises:
-        RecipeError: There is no such kind.
-    """
-    kind = registry.load(group, name)
-    head = ("key", "default", "meaning (value)")
-    rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
-    noun = registry.noun_of(group)
-    text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
-    return "\n".join([f"{noun} {name}", *_title(kind_summary(kind)), "", *text])
-
-
-def _default(key: Key) -> str:
-    return "required" if key.required else quantity(key.default, key.unit)
-
-
-def _expected(key: Key) -> str:
-    bounds = [f">= {key.low:g}" if key.low is not None else "", f"<= {key.high:g}" if key.high is not None else ""]
-    return ", ".join([key.expected, *filter(None, bounds)])
-
-
-def kind_to_dict(group: str, name: str) -> dict[str, Any]:
-    """Describe a kind of stage or constraint for JSON.
-
-    Raises:
-        RecipeError: There is no such kind.
-    """
-    kind = registry.load(group, name)
-    left_out = ("hint", "default", "late")
-    entries = [
-        {
-            **{field.name: getattr(key, field.name) for field in dataclasses.fields(key) if field.name not in left_out},
-            "expected": key.expected,
-            "required": key.required,
-            **({} if key.required else {"default": _plain_default(key.default)}),
-        }
-        for key in keys(kind)
-    ]
-    noun = registry.noun_of(group)
-    return {"kind": noun, "name": name, "summary": kind_summary(kind), "keys": entries}
-
-
-def _plain_default(value: Any) -> Any:
-    return [value.low, value.high] if isinstance(value, Range) else value
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:

@@ -99,7 +99,7 @@ def _problems() -> list[dict[str, Any]]:
 
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
-    from cnpgen.cli.describe import kind_summary
+    from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.errors import RecipeError
     from cnpgen.schema import registry
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import RecipeError, UsageError, nearest
+from cnpgen.schema.toml import MARKS
 
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
@@ -24,7 +25,7 @@ shown: every mistake is a line on stderr, with file and key, and the exit code i
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    title = "describe a recipe, or a kind of stage or constraint"
+    title = "describe a recipe, a kind of stage or constraint, or the keys of recipe files"
     parser = add_command(commands, "show", run, title=title, text=_TEXT)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
@@ -35,6 +36,8 @@ def add(commands: "Commands[Parser]") -> None:
     )
     what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
     what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
+    text = "all keys of problem, pipeline, dataset and suite files, in Markdown (docs/keys.md); WHAT is one of these"
+    what.add_argument("--keys", metavar="WHAT", nargs="?", choices=("all", *MARKS), const="all", help=text)
     parser.add_argument("--kind", choices=KINDS, help="which one, where several recipes have the same name")
     add_json(parser)
 
@@ -42,23 +45,33 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli import describe
-    from cnpgen.schema import registry
     from cnpgen.store.files.documents import plain, render
 
     if arguments.recipe is None:
-        group, name = (
-            (registry.STAGES, arguments.stage) if arguments.stage else (registry.CONSTRAINTS, arguments.constraint)
-        )
         if arguments.kind:
             raise UsageError("--kind says which recipe is meant: it goes with NAME or FILE only")
-        print(
-            render(plain(describe.kind_to_dict(group, name))) if arguments.json else describe.describe_kind(group, name)
-        )
+        print(_about_kinds(arguments))
         return 0
     check_recipe(arguments.recipe)
     recipe = load_any(arguments.recipe, arguments.kind)
     print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
     return 0
+
+
+def _about_kinds(arguments: argparse.Namespace) -> str:
+    """Describe a kind of stage or constraint, or the keys of recipe files."""
+    from cnpgen.cli import describe_keys
+    from cnpgen.schema import registry
+    from cnpgen.store.files.documents import plain, render
+
+    if arguments.keys:
+        kinds = tuple(MARKS) if arguments.keys == "all" else (arguments.keys,)
+        found = describe_keys.keys_to_dict(kinds) if arguments.json else describe_keys.describe_keys(kinds)
+    else:
+        group = registry.STAGES if arguments.stage else registry.CONSTRAINTS
+        describe = describe_keys.kind_to_dict if arguments.json else describe_keys.describe_kind
+        found = describe(group, arguments.stage or arguments.constraint)
+    return render(plain(found)) if arguments.json else str(found)
 
 
 def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":

@@ -44,14 +44,16 @@ class Problem:
 
     name: str = field("name of the problem: lower-case letters, digits and hyphens", pattern=NAME)
     title: str = field("one line about it", default="")
-    robot: RobotSpec = field("the robot")
-    limits: LimitSpec = field("its planning limits")
-    object: HeldObject | None = field("what it holds", default=None)
+    robot: RobotSpec = field("which robot, and what of it is planned")
+    limits: LimitSpec = field("its planning limits, as fractions of the URDF's or in their place")
+    object: HeldObject | None = field("an upright cuboid that it holds", default=None)
     payload: Payload | None = field("what else it carries at its tip", default=None, late=True)
     obstacle: tuple[Obstacle, ...] = field("what stands around the robot", default=(), form="[[obstacle]] tables")
-    constraint: tuple[Constraint, ...] = field("the constraint manifold", default=(), form="[[constraint]] tables")
-    trajectory: TrajectorySpec = field("parameterisation of motions", default=TrajectorySpec())
-    objective: Objective = field("what a good motion is", default=Objective())
+    constraint: tuple[Constraint, ...] = field(
+        "what every state of a valid motion meets", default=(), form="[[constraint]] tables"
+    )
+    trajectory: TrajectorySpec = field("how motions are parameterised", default=TrajectorySpec())
+    objective: Objective = field("what is minimised", default=Objective())
     path: Path = Path()
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:

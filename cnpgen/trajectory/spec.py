@@ -13,8 +13,12 @@ class TrajectorySpec:
     """How motions are parameterised (paper, section on trajectory parameterisation)."""
 
     degree: int = field("degree of both B-splines", default=7, low=3, high=MOST_DEGREE)
-    path_control_points: int = field("control points of p(s)", default=15, low=6, high=MOST_POINTS)
-    rate_control_points: int = field("control points of r(s)", default=20, low=4, high=MOST_POINTS)
+    path_control_points: int = field(
+        "control points of p(s), the path in joint space", default=15, low=6, high=MOST_POINTS
+    )
+    rate_control_points: int = field(
+        "control points of r(s) = ds/dt, the rate along it", default=20, low=4, high=MOST_POINTS
+    )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""

@@ -9,26 +9,19 @@ import pytest
 from cnpgen.cli.describe import (
     WIDTH,
     describe,
-    describe_kind,
     describe_pipeline,
-    kind_summary,
-    kind_to_dict,
     numbers,
     quantity,
     recipe_to_dict,
     table,
 )
-from cnpgen.errors import RecipeError
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.problems.load import load_problem
-from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
 from tests.examples.shaped_robot import write_problem
-
-KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
 
 
 @pytest.mark.parametrize(
@@ -121,34 +114,6 @@ def test_every_kind_of_recipe_has_a_json_form(kind):
     assert content["kind"] == kind
     assert len(content["limits"]["velocity_limit"]["values"]) == len(content["joints"]) == 7
     assert ("stages" in content) == (kind != "problem")
-
-
-@pytest.mark.parametrize(("group", "name"), KINDS)
-def test_every_kind_of_stage_and_constraint_is_described(group, name):
-    text, content = describe_kind(group, name), json.loads(json.dumps(plain(kind_to_dict(group, name))))
-    assert name in text.splitlines()[0]
-    assert content["summary"]
-    for key in content["keys"]:
-        assert key["name"] in text
-        assert key["doc"]
-        assert key["required"] == ("default" not in key)
-    assert all(len(line) <= WIDTH for line in text.splitlines())
-
-
-def test_an_unknown_kind_is_refused_with_the_nearest_one():
-    with pytest.raises(RecipeError, match="did you mean 'start-ik'"):
-        describe_kind(registry.STAGES, "start-ikk")
-
-
-def test_a_summary_is_the_first_line_without_markup():
-    class Kind:
-        """Do ``this``.
-
-        And that.
-        """
-
-    assert kind_summary(Kind) == "Do this."
-    assert kind_summary(type("Bare", (), {})) == ""
 
 
 def test_a_table_is_aligned_and_its_last_column_wraps():

@@ -12,6 +12,7 @@ from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.linalg import Scalar, dot
 from cnpgen.symbolic.state import SymbolicState, Vec, symbols
 
@@ -77,7 +78,7 @@ def tip_and_excess(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, dq, ddq, tops) -> (tip, excess)``: by how much the worst bound is exceeded, in its own unit."""
     import casadi as ca
 
-    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", len(problem.obstacle)))
+    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", count_numbers(problem.obstacle)))
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops) = (symbols(name, width) for name, width in names)
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, problem.object_size)
     tip, table = state.kinematics.tip, table_of(problem)
@@ -114,7 +115,8 @@ def _off_the_way(state: SymbolicState, tops: Vec) -> list[Scalar]:
     ]
     excess: list[Scalar] = [1.0 - rotation[2][2] - UPRIGHT]
     for box, top in zip(state.obstacles, tops, strict=True):
-        sides = ((box.x.low, box.x.high), (box.y.low, box.y.high), (-np.inf, top))
+        spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
+        sides = (*spans, (-np.inf, top))
         outside = [
             ca.fmax(ca.fmax(low - place, place - high), 0) for place, (low, high) in zip(tip, sides, strict=True)
         ]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class Collision(Stage):
     """Rejects configurations where the arm or the object enters an obstacle."""
 
-    end: str = field("which end", choices=("start", "goal", "both"))
+    end: str = field("which end is looked at", choices=("start", "goal", "both"))
     judge: str = field("what decides: the exact segment test alone, or Coal after it", choices=("segments", "coal"))
 
     @property

@@ -23,7 +23,7 @@ def wrap(angle: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class HitAngleToGoal(Stage):
-    """Towards a point behind the goal position, with uniform noise."""
+    """The puck is hit towards a point behind the goal position, with uniform noise."""
 
     needs = ("goal_xyz",)
     target: tuple[float, float] = field("where the puck is sent: x, y", unit="m")
@@ -54,7 +54,7 @@ class HitAngleToGoal(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class HitAngleInCone(Stage):
-    """Uniform in a cone about the line from start to goal.
+    """The puck is hit in a direction uniform in a cone about the line from start to goal.
 
     The same law as drawing all directions and rejecting those outside the cone, without the rejections.
     """

@@ -130,7 +130,7 @@ class TableVelocity(Stage):
 class TableAcceleration(Stage):
     """A random acceleration with ``J_z ddq + dJ_z dq = 0`` at one end, within the acceleration and torque limits."""
 
-    end: str = field("which end", choices=("start", "goal"), default="start")
+    end: str = field("of which end an acceleration is drawn", choices=("start", "goal"), default="start")
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from cnpgen.store.field import Field
 
 @dataclass(frozen=True, kw_only=True)
 class BallisticReach(Stage):
-    """``p + v t`` is over the table: at the start forwards, at the goal both ways (after the hit, and before it)."""
+    """The tip, going on as it moves, stays over the table: ``p + v t`` after the start, before and after the goal."""
 
     start_time: float = field("how far ahead of the start", unit="s", default=0.0, low=0.0)
     goal_time: float = field("how far ahead of the goal, and before it", unit="s", default=0.0, low=0.0)

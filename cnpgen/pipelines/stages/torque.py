@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class GravityTorque(Stage):
-    """Holding still needs no more torque than the limit, at one end."""
+    """Rejects configurations in which holding still needs more torque than the limit, at one end."""
 
-    end: str = field("which end", choices=("start", "goal"))
+    end: str = field("which end is looked at", choices=("start", "goal"))
 
     @property
     def needs(self) -> tuple[str, ...]:

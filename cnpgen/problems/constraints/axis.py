@@ -60,7 +60,7 @@ class TipAxis(Constraint):
 
 @dataclass(frozen=True, kw_only=True)
 class Axis(TipAxis):
-    """The tip's axis within an angle of a direction; with no angle it is held along it, and at the ends it rests."""
+    """An axis of the tip is within an angle of a direction; with no angle it is along it, and rests at the ends."""
 
     reason = "tool tilted"
     axis: Vector = field("the axis in the tip's frame, of any length", default=(0.0, 0.0, 1.0))

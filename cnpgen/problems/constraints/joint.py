@@ -36,7 +36,7 @@ def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64]) -> t
 
 @dataclass(frozen=True, kw_only=True)
 class JointPosition(Constraint):
-    """``lower <= q <= upper``."""
+    """Every joint is between its limits of position: ``lower <= q <= upper``."""
 
     reason = "joint position limit"
     tolerance: float = field("how far a motion may be off and still be called valid", unit="rad", low=0.0)
@@ -54,7 +54,7 @@ class JointPosition(Constraint):
 
 @dataclass(frozen=True, kw_only=True)
 class JointVelocity(_RelativeLimit):
-    """``|dq| <= velocity limit``."""
+    """No joint is faster than its limit of velocity: ``|dq| <= limit``."""
 
     reason = "joint velocity limit"
 
@@ -69,7 +69,7 @@ class JointVelocity(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointAcceleration(_RelativeLimit):
-    """``|ddq| <= acceleration limit``."""
+    """No joint accelerates by more than its limit: ``|ddq| <= limit``."""
 
     reason = "joint acceleration limit"
 
@@ -107,7 +107,7 @@ class JointJerk(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTorque(_RelativeLimit):
-    """``|ID(q, dq, ddq)| <= torque limit``, payload included."""
+    """No joint needs more torque than its limit, payload included: ``|ID(q, dq, ddq)| <= limit``."""
 
     reason = "joint torque limit"
 

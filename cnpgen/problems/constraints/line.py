@@ -11,7 +11,7 @@ from cnpgen.schema.keys import Range, field
 
 @dataclass(frozen=True, kw_only=True)
 class Line(TipManifold):
-    """The tip on the line through ``point`` along ``direction``; at the ends it also moves and accelerates along it."""
+    """The tip is on a line through ``point``, along ``direction``; at the ends it moves and accelerates along it."""
 
     reason = "off the line"
     kinks = FUNNEL

@@ -12,7 +12,7 @@ from cnpgen.schema.keys import Range, field
 
 @dataclass(frozen=True, kw_only=True)
 class Plane(TipManifold):
-    """``normal . (p - point) = 0`` for the tip p; at the ends it also moves and accelerates along the plane only."""
+    """The tip p stays in a plane: ``normal . (p - point) = 0``; at the ends it moves and accelerates along it only."""
 
     reason = "off the plane"
     kinks = FUNNEL

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Pose(TipManifold):
-    """``R = R_wanted`` for the tip, in a box of the world; at the ends it does not turn.
+    """The tip is turned one way, ``R = R_wanted``, in a box of the world; at the ends it does not turn.
 
     Where a range is a single point, that coordinate is held. The three values of the orientation are the axis times the
     sine of the angle of ``R_wanted^T R``: angles [rad] to first order, and 0 at half a turn, too, which is excluded.

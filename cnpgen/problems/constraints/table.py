@@ -11,7 +11,7 @@ from cnpgen.schema.keys import Range, field
 
 @dataclass(frozen=True, kw_only=True)
 class Table(TipManifold):
-    """The tip in a rectangle at the table's height; at the ends also ``dz/dt = 0`` and ``d2z/dt2 = 0``.
+    """The tip stays in a rectangle at the table's height; at the ends also ``dz/dt = 0`` and ``d2z/dt2 = 0``.
 
     It is a ``plane`` across z whose rectangle is along x and y.
     """

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class TipSpeed(Constraint):
-    """``|v| <= limit`` for the velocity v of the tip, stated of the square, which has a gradient at rest, too."""
+    """The tip is no faster than a limit, ``|v| <= limit``; stated of the square, which has a gradient at rest, too."""
 
     reason = "tip too fast"
     limit: float = field("highest speed of the tip", unit="m/s", low=1e-6)

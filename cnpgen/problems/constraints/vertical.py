@@ -9,7 +9,7 @@ from cnpgen.schema.keys import field
 
 @dataclass(frozen=True, kw_only=True)
 class Vertical(TipAxis):
-    """``R_02 = R_12 = 0`` and ``R_22 > 0``: an ``axis`` of the tip, z, held along the world's."""
+    """The tip's z axis points up, as ``axis`` would hold it: ``R_02 = R_12 = 0`` and ``R_22 > 0``."""
 
     reason = "not vertical"
     tolerance: float = field("how far a motion may tilt and still be called valid", unit="rad", low=1e-9)

@@ -1,0 +1,163 @@
+"""The keys of recipe files, as the schema knows them: those of one kind of stage or constraint, or all of them."""
+
+import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, get_args
+
+from cnpgen.benchmark.suite import Suite
+from cnpgen.cli.describe import quantity, table, title_lines
+from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.problem import Problem
+from cnpgen.schema import registry
+from cnpgen.schema.keys import Key, Range, keys
+from cnpgen.schema.toml import Kind
+
+FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe, "suite": Suite}
+"""What the files of a kind are read as."""
+
+_GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS}
+_INTRODUCTION = """\
+# Keys of recipe files
+
+Every key that a recipe file may have: what may be written, what counts where it is left out, and what it means.
+`cnpgen show --keys` prints this page, `cnpgen show --keys pipeline` one part of it, and `--json` the same for programs.
+
+A number without a unit is in SI. A string may carry another unit of the same dimension: `"20 ms"`, `"[-170, 170] deg"`,
+`"5 %"`. A range is `"[low, high] unit"`; a single number is a range of one point."""
+
+
+def kind_summary(kind: type) -> str:
+    """Return the first line of a kind's documentation, without markup."""
+    return _first_line(kind).replace("`", "")
+
+
+def _first_line(kind: type) -> str:
+    """Return the first line of a kind's documentation, in Markdown."""
+    return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "`")
+
+
+def describe_kind(group: str, name: str) -> str:
+    """Describe a kind of stage or constraint: what it does, and the keys of its table.
+
+    Args:
+        group: ``registry.STAGES`` or ``registry.CONSTRAINTS``.
+        name: Name of the kind.
+
+    Raises:
+        RecipeError: There is no such kind.
+    """
+    kind = registry.load(group, name)
+    head = ("key", "default", "meaning (value)")
+    rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
+    text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
+    return "\n".join([f"{registry.noun_of(group)} {name}", *title_lines(kind_summary(kind)), "", *text])
+
+
+def kind_to_dict(group: str, name: str) -> dict[str, Any]:
+    """Describe a kind of stage or constraint for JSON.
+
+    Raises:
+        RecipeError: There is no such kind.
+    """
+    return {"kind": registry.noun_of(group), "name": name, **_table_to_dict(registry.load(group, name))}
+
+
+def describe_keys(kinds: Sequence[Kind]) -> str:
+    """Describe all keys of files of some kinds, in Markdown."""
+    parts = [_INTRODUCTION] if len(kinds) > 1 else []
+    for kind in kinds:
+        parts += [f"## {kind.capitalize()} files", _first_line(FILES[kind]), *_sections(FILES[kind], "")]
+    return "\n\n".join(parts)
+
+
+def keys_to_dict(kinds: Sequence[Kind]) -> dict[str, Any]:
+    """Describe all keys of files of some kinds for JSON; of a table of tables each has its own keys."""
+    return {kind: _table_to_dict(FILES[kind]) for kind in kinds}
+
+
+def _sections(cls: type, path: str) -> Iterator[str]:
+    """Describe the keys of a table, and then those of every table in it that is written in the same file."""
+    yield _markdown_table(cls)
+    for key in keys(cls):
+        part = _part(key)
+        name = f"{path}.{key.name}" if path else key.name
+        if part in _GROUPS:
+            yield f"### `[[{name}]]`"
+            yield "The key `use` of each says of which kind it is; the other keys are those of the kind."
+            for use in registry.names(_GROUPS[part]):
+                kind = registry.load(_GROUPS[part], use)
+                yield f"#### `{use}`"
+                yield _first_line(kind)
+                yield _markdown_table(kind) if keys(kind) else "It has no keys."
+        elif part is not None:
+            yield f"### `[[{name}]]`" if _is_array(key) else f"### `[{name}]`"
+            yield _first_line(part)
+            yield from _sections(part, name)
+
+
+def _part(key: Key) -> type | None:
+    """Return the table, or one of the tables, that a key holds in the same file; None where it holds a value."""
+    found: type = get_args(key.hint)[0] if _is_array(key) else key.hint
+    if found in _GROUPS:
+        return found
+    return found if dataclasses.is_dataclass(found) and keys(found) and found not in FILES.values() else None
+
+
+def _is_array(key: Key) -> bool:
+    args = get_args(key.hint)
+    return bool(args) and dataclasses.is_dataclass(args[0]) and args[0] is not Range
+
+
+def _markdown_table(cls: type) -> str:
+    rows = [
+        (f"`{key.name}`", _escaped(_expected(key)), _escaped(_default(key)), _escaped(key.doc)) for key in keys(cls)
+    ]
+    lines = [("key", "value", "default", "meaning"), ("---",) * 4, *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _escaped(text: str) -> str:
+    """Return a text as a cell of a Markdown table may have it."""
+    return re.sub(r"<(?=\w)", r"\<", text.replace("|", r"\|"))
+
+
+def _default(key: Key) -> str:
+    if key.required:
+        return "required"
+    return "those of its keys" if _part(key) and key.default else quantity(key.default, key.unit)
+
+
+def _expected(key: Key) -> str:
+    """Say what may be written: ``"a length [m], at least 0"``."""
+    bounds = {"at least": key.low, "at most": key.high}
+    said = [f"{which} {_exactly(bound)}" for which, bound in bounds.items() if bound is not None]
+    return ", ".join([key.expected, *said])
+
+
+def _exactly(bound: float) -> str:
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"
+
+
+def _table_to_dict(cls: type) -> dict[str, Any]:
+    return {"summary": kind_summary(cls), "keys": [_key_to_dict(key) for key in keys(cls)]}
+
+
+def _key_to_dict(key: Key) -> dict[str, Any]:
+    """Describe a key, and the table or the tables that it holds."""
+    left_out, part = ("hint", "default", "late"), _part(key)
+    content = {spec.name: getattr(key, spec.name) for spec in dataclasses.fields(key) if spec.name not in left_out}
+    content |= {"expected": key.expected, "required": key.required}
+    if part in _GROUPS:
+        group = _GROUPS[part]
+        return content | {"kinds": [kind_to_dict(group, use) for use in registry.names(group)]}
+    if part is not None:
+        return content | {"table": _table_to_dict(part)}
+    return content if key.required else content | {"default": _plain_default(key.default)}
+
+
+def _plain_default(value: Any) -> Any:
+    return [value.low, value.high] if isinstance(value, Range) else value
