@@ -28,14 +28,24 @@ def boxes_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> tuple[Array
     Raises:
         UsageError: Nothing is held, or an obstacle is no upright box.
     """
+    size = require_transport(problem)
+    solids = solids_of(problem.obstacle, obstacle_tops(problem, start_xyz, goal_xyz))
+    boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in solids]
+    return size, boxes
+
+
+def require_transport(problem: Problem) -> Array:
+    """Return the edge lengths of the held object [m], shape (3,).
+
+    Raises:
+        UsageError: Nothing is held, or an obstacle is no upright box.
+    """
     if problem.object_size is None:
         raise UsageError(f"it plans hits on a table and transports, and {problem.name!r} has neither table nor object")
     others = [each.name for each in problem.obstacle if not each.upright]
     if others:
         raise UsageError(f"it knows upright boxes only, and {problem.name!r} has {', '.join(others)}")
-    solids = solids_of(problem.obstacle, obstacle_tops(problem, start_xyz, goal_xyz))
-    boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in solids]
-    return np.array(problem.object_size), boxes
+    return np.array(problem.object_size)
 
 
 def distance(point: Array, box: Box) -> tuple[float, Array]:

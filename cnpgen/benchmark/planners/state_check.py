@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.boxes import CORNERS
+from cnpgen.benchmark.planners.boxes import CORNERS, require_transport
 from cnpgen.benchmark.planners.cbirrt import APART, DEEP
-from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
@@ -33,12 +32,12 @@ class StateCheck:
         robot: Its robot.
 
     Raises:
-        UsageError: There is neither a table nor a held object.
+        UsageError: There is neither a table nor a held object, or an obstacle is no upright box.
     """
 
     def __init__(self, problem: Problem, robot: "Robot") -> None:
-        if problem.object_size is None and table_of(problem) is None:
-            raise UsageError(f"it plans hits on a table and transports, and {problem.name!r} has neither")
+        if table_of(problem) is None:
+            require_transport(problem)
         self._problem, self._robot = problem, robot
         self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_excess)
 
