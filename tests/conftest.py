@@ -54,6 +54,12 @@ def pytest_configure(config: pytest.Config) -> None:
         config.addinivalue_line("filterwarnings", "ignore:.*running on the NumPy backend:RuntimeWarning")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Choose one process more than there are processors: a quarter of the time is waiting for other processes."""
+    return (os.cpu_count() or 1) + 1
+
+
 @pytest.fixture(scope="session")
 def fastest() -> Backend:
     """The fastest backend that works here."""

@@ -132,12 +132,10 @@ class KernelLibrary:
         grid: GridSpec | None = None,
         dtype: Dtype = "float64",
     ) -> Tape:
-        import importlib.metadata
-
         identity = {
             "builder": f"{builder.__module__}.{builder.__qualname__}",
             "source": _source_digests(builder),
-            "versions": [importlib.metadata.version(name) for name in ("casadi", "pin")],
+            "versions": _versions(),
             "problem": self.identity,
             "loop": [loop.tolerance, loop.limit] if loop else None,
             "grid": [grid.arguments, grid.results] if grid else None,
@@ -167,6 +165,13 @@ class KernelLibrary:
             make_private(path.parent)
             write_file(path, tape.to_bytes())
             keep_from_others(path)
+
+
+@cache
+def _versions() -> list[str]:
+    import importlib.metadata
+
+    return [importlib.metadata.version(name) for name in ("casadi", "pin")]
 
 
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
