@@ -23,8 +23,10 @@ from cnpgen.machine.versions import __version__
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import resolved
+from cnpgen.problems.record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import integer, number
+from cnpgen.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.simulator.execute import load_mujoco
 from cnpgen.simulator.plant import Plant, as_plant
 from cnpgen.store.files.documents import canonical_sha256, plain
@@ -72,6 +74,7 @@ def run_benchmark(
     planners: Sequence[str] = FASTEST,
     n: int | None = None,
     plants: Sequence[str | Plant] = (),
+    environment: str | Path | None = None,
     time_limit: float = 60.0,
     workers: int | None = None,
     force: bool = False,
@@ -88,26 +91,32 @@ def run_benchmark(
         planners: Names of planners.
         n: Only the first so many problems; of a random suite it may be more.
         plants: Plants that plans are executed on; none by default.
+        environment: A clone of the Air Hockey Challenge's environment; plans are executed there, too, as by a plant
+            that is called "challenge".
         time_limit: How long a planner may take for a problem [s]; those that cannot tell the time may take longer.
         workers: Processes that execute plans; default one per available core.
         force: Whether results of another suite, version or time limit may be thrown away.
         progress: Called after every problem.
 
     Raises:
-        UsageError: There is no such planner or plant, it cannot plan for such problems, or the folder has results of
-            another run.
+        UsageError: There is no such planner, plant or environment, it cannot plan for such problems, or the folder
+            has results of another run.
         RecipeError: The suite has mistakes.
         MachineError: MuJoCo is missing, or the results cannot be written.
     """
     loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     _check_planners(planners)
     robots = tuple(as_plant(plant) for plant in plants)
+    if environment is not None:
+        robots += (challenge_plant(environment),)
     if robots:
         load_mujoco()
     limit = number("time_limit", time_limit)
     if limit <= 0:
         raise UsageError(f"time_limit must be above 0 s, got {time_limit:g} s")
     problems, lead = loaded.problems(None if n is None else integer("n", n, least=1))
+    if environment is not None:
+        check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit)
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
