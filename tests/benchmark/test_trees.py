@@ -11,14 +11,15 @@ from scipy.stats import norm
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.cbirrt import Search
-from cnpgen.benchmark.planners.imitation import likelihood_gradient, train_proposals
 from cnpgen.benchmark.planners.mpc_mpnet import MPCMPNet, ProposedExtension
 from cnpgen.benchmark.planners.proposals import (
     LEAST,
     Proposals,
+    likelihood_gradient,
     load_proposals,
     save_proposals,
     shipped_proposals,
+    train_proposals,
 )
 from cnpgen.benchmark.planners.sst import STEP, RandomExtension
 from cnpgen.benchmark.planners.state_check import TABLE, UPRIGHT, StateCheck
