@@ -53,10 +53,15 @@ class Benchmark:
     problems: Plans
     lead: Lead | None
     results: dict[str, list[dict[str, Any]]]
-    plants: tuple[str, ...] = ()
+    plants: tuple[Plant, ...] = ()
 
     def __repr__(self) -> str:
         return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
+
+    @property
+    def executions(self) -> tuple[str, ...]:
+        """Names of the plants; one empty name where nothing was executed."""
+        return tuple(plant.name for plant in self.plants) or ("",)
 
     def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
         """Return ratios, medians, quartiles and p-values of every planner; see ``summarise_results``.
@@ -130,7 +135,7 @@ def run_benchmark(
                 results, plant, problems, lead, workers=workers, tell=partial(tell, f"{name}, {plant.name} plant")
             )
         rows[name] = [results.rows[index] for index in range(len(problems))]
-    return Benchmark(loaded, problems, lead, rows, tuple(plant.name for plant in robots))
+    return Benchmark(loaded, problems, lead, rows, robots)
 
 
 def _check_planners(planners: Sequence[str]) -> None:
@@ -181,8 +186,8 @@ def _row(index: int, problem: Plans, attempt: Attempt) -> dict[str, Any]:
         "error": attempt.error,
         "answer": answer_to_dict(attempt.answer),
     }
-    if attempt.answer is not None:
-        row["verdict"] = verdict_to_dict(judge_answer(problem, attempt.answer))
+    if attempt.answer is not None:  # judged as it is read back: by the problem's boundary conditions, not by its own
+        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, row["answer"])))
     return row
 
 

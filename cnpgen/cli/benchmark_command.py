@@ -110,7 +110,7 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
         "suite_version": found.suite.version,
         "problems": len(found.problems),
         "folder": str(folder),
-        "planners": {plant or "planned": found.summary(plant) for plant in found.plants or ("",)},
+        "planners": {plant or "planned": found.summary(plant) for plant in found.executions},
     }
 
 
@@ -120,7 +120,7 @@ def _text(found: "Benchmark") -> str:
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
-    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.plants or ("",)]
+    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
     return "\n\n".join([head, *("\n".join(lines) for lines in tables)])
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.benchmark.report import save_benchmark_report
 from cnpgen.benchmark.run import run_benchmark
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.boundary_problems import draw_boundary_problems
@@ -50,8 +51,9 @@ def test_the_puck_and_the_arm_are_seen_in_the_robots_frame(plans: Plans) -> None
 
 def test_a_benchmark_executes_there_too(tmp_path: Path) -> None:
     found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, environment=CLONE, workers=1)
-    assert found.plants == ("challenge",)
+    assert found.executions == ("challenge",)
     assert found.results["cnp-b"][0]["executed"]["challenge"]["success"]
+    assert "executed by the challenge plant" in save_benchmark_report(found, tmp_path / "report.html").read_text()
 
 
 def test_the_command_line_executes_there_and_refuses_what_is_no_clone(plans: Plans, tmp_path: Path) -> None:
