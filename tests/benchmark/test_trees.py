@@ -228,6 +228,13 @@ def test_mpc_mpnet_keeps_its_limits_and_gets_away_from_the_start(suite: str) -> 
     assert np.all(np.abs(found.dq) <= robot.velocity_limit)
 
 
+def test_a_network_of_another_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = "cnpgen.benchmark.planners.mpc_mpnet.shipped_proposals"
+    monkeypatch.setattr(other, lambda _: shipped_proposals("heavy-object"))
+    with pytest.raises(UsageError, match="'airhockey' is of another arm or world"):
+        MPCMPNet().prepare(Setting(one_of("hits-81").problem))
+
+
 def test_mpc_mpnet_goes_on_elsewhere_after_a_step_that_led_nowhere() -> None:
     task = one_of("hits-81", 40)
     steer = steering_of(task)
