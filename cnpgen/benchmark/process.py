@@ -138,22 +138,27 @@ def _attempt(plan: Any, problem: Plans) -> Attempt:
     try:
         with one_thread():
             answer = plan(problem)
-        ending, error = _judged_form(answer)
+        ending, error = _ending_of(answer, problem)
     except Exception as found:  # noqa: BLE001 - likewise
         error = _said(found)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     return Attempt(ending, answer if ending == Ending.PLANNED else None, seconds, cpu, error)
 
 
-def _judged_form(answer: Any) -> tuple[Ending, str]:
-    """Say whether an answer is one."""
+def _ending_of(answer: Any, problem: Plans) -> tuple[Ending, str]:
+    """Say whether an answer is one, with the joints of the problem."""
     if answer is None:
         return Ending.NO_PLAN, ""
     if isinstance(answer, Plans) and len(answer) == 1:
-        return Ending.PLANNED, ""
-    if isinstance(answer, Trajectory):
-        return Ending.PLANNED, ""
-    return Ending.FAILED, f"expected one plan, a Trajectory or None, got {answer!r:.60}"
+        joints = answer.path_control_points.shape[2]
+    elif isinstance(answer, Trajectory):
+        joints = answer.q.shape[1]
+    else:
+        return Ending.FAILED, f"expected one plan, a Trajectory or None, got {answer!r:.60}"
+    wanted = problem.boundary.start_q.shape[1]
+    if joints != wanted:
+        return Ending.FAILED, f"the problem has {wanted} joints, its answer {joints}"
+    return Ending.PLANNED, ""
 
 
 def _said(error: Exception) -> str:

@@ -12,7 +12,7 @@ from cnpgen.benchmark.run import Benchmark
 from cnpgen.benchmark.statistics import FIGURES, FLAGS, values_of
 from cnpgen.errors import MachineError
 from cnpgen.simulator.picture import save_picture
-from cnpgen.simulator.plant import as_plant
+from cnpgen.simulator.plant import Plant
 from cnpgen.store.files.atomic import write_file
 
 PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> what the paper's text says of it
@@ -45,7 +45,7 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path) -> Path:
     parts = [
         f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
     ]
-    for plant in benchmark.plants or ("",):
+    for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
         parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
     parts += _pictures(benchmark, place.parent)
@@ -115,18 +115,16 @@ def _boxes(benchmark: Benchmark, plant: str) -> str:
 
 
 def _pictures(benchmark: Benchmark, folder: Path) -> list[str]:
-    """Draw what each planner's robot had done at the end of its first plan, where this machine can draw."""
+    """Draw the end of the first plan of each planner that could be executed, where this machine can draw."""
     parts = []
     for name, rows in benchmark.results.items() if benchmark.plants else ():
-        index = next((row["problem"] for row in rows if row["answer"] is not None), None)
+        plant = benchmark.plants[0]
+        index = next((row["problem"] for row in rows if _was_executed(row, plant.name)), None)
         if index is None:
             continue
-        problem, lead = benchmark.problems[index], benchmark.lead and benchmark.lead[index]
-        answer = answer_from_dict(problem, rows[index]["answer"])
         file = folder / f"{name}.png"
         try:
-            scene, reference, execution = execution_of(problem, answer, lead, as_plant(benchmark.plants[0]))
-            save_picture(file, scene, execution, reference.ticks)
+            _draw(benchmark, rows[index], plant, file)
         except MachineError as error:
             return [f"<p>No pictures: {escape(str(error))}</p>"]
         data = base64.b64encode(file.read_bytes()).decode()
@@ -135,3 +133,15 @@ def _pictures(benchmark: Benchmark, folder: Path) -> list[str]:
         )
         file.unlink()
     return parts
+
+
+def _was_executed(row: dict[str, Any], plant: str) -> bool:
+    executed = row.get("executed", {}).get(plant)
+    return executed is not None and "failure" not in executed
+
+
+def _draw(benchmark: Benchmark, row: dict[str, Any], plant: Plant, file: Path) -> None:
+    problem, lead = benchmark.problems[row["problem"]], benchmark.lead and benchmark.lead[row["problem"]]
+    answer = answer_from_dict(problem, row["answer"])
+    scene, reference, execution = execution_of(problem, answer, lead, plant)
+    save_picture(file, scene, execution, reference.ticks)

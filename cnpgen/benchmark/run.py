@@ -23,8 +23,10 @@ from cnpgen.machine.engine import Engine, Team, assembled
 from cnpgen.machine.versions import __version__
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import resolved
+from cnpgen.problems.record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import integer, number
+from cnpgen.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.simulator.execute import load_mujoco
 from cnpgen.simulator.plant import Plant, as_plant
 from cnpgen.store.files.documents import canonical_sha256, plain
@@ -58,10 +60,15 @@ class Benchmark:
     problems: Plans
     lead: Lead | None
     results: dict[str, list[dict[str, Any]]]
-    plants: tuple[str, ...] = ()
+    plants: tuple[Plant, ...] = ()
 
     def __repr__(self) -> str:
         return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
+
+    @property
+    def executions(self) -> tuple[str, ...]:
+        """Names of the plants; one empty name where nothing was executed."""
+        return tuple(plant.name for plant in self.plants) or ("",)
 
     def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
         """Return ratios, medians, quartiles and p-values of every planner; see ``summarise_results``.
@@ -79,6 +86,7 @@ def run_benchmark(
     planners: Sequence[str] = FASTEST,
     n: int | None = None,
     plants: Sequence[str | Plant] = (),
+    environment: str | Path | None = None,
     time_limit: float = 60.0,
     workers: int | None = None,
     engine: str | None = None,
@@ -98,6 +106,8 @@ def run_benchmark(
         planners: Names of planners.
         n: Only the first so many problems; of a random suite it may be more.
         plants: Plants that plans are executed on; none by default.
+        environment: A clone of the Air Hockey Challenge's environment; plans are executed there, too, as by a plant
+            that is called "challenge".
         time_limit: How long a planner may take for a problem [s]; those that cannot tell the time may take longer.
         workers: Processes that execute plans, and with an engine plan; default one per available core.
         engine: Where the workers run, as of ``make_dataset``; by default plans are made on this machine, one by one.
@@ -106,8 +116,8 @@ def run_benchmark(
         progress: Called after every problem.
 
     Raises:
-        UsageError: There is no such planner or plant, it cannot plan for such problems, or the folder has results of
-            another run.
+        UsageError: There is no such planner, plant or environment, it cannot plan for such problems, or the folder
+            has results of another run.
         RecipeError: The suite has mistakes.
         MachineError: MuJoCo is missing, the results cannot be written, or a cluster cannot be reached.
     """
@@ -115,12 +125,16 @@ def run_benchmark(
     loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     _check_planners(planners)
     robots = tuple(as_plant(plant) for plant in plants)
+    if environment is not None:
+        robots += (challenge_plant(environment),)
     if robots:
         load_mujoco()
     limit = number("time_limit", time_limit)
     if limit <= 0:
         raise UsageError(f"time_limit must be above 0 s, got {time_limit:g} s")
     problems, lead = loaded.problems(None if n is None else integer("n", n, least=1))
+    if environment is not None:
+        check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit)
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
@@ -136,7 +150,7 @@ def run_benchmark(
                     results, plant, problems, lead, team=team, tell=partial(tell, f"{name}, {plant.name} plant")
                 )
             rows[name] = [results.rows[index] for index in range(len(problems))]
-    return Benchmark(loaded, problems, lead, rows, tuple(plant.name for plant in robots))
+    return Benchmark(loaded, problems, lead, rows, robots)
 
 
 def _check_planners(planners: Sequence[str]) -> None:
@@ -208,8 +222,8 @@ def _row(index: int, problem: Plans, attempt: Attempt) -> dict[str, Any]:
         "error": attempt.error,
         "answer": answer_to_dict(attempt.answer),
     }
-    if attempt.answer is not None:
-        row["verdict"] = verdict_to_dict(judge_answer(problem, attempt.answer))
+    if attempt.answer is not None:  # judged as it is read back: by the problem's boundary conditions, not by its own
+        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, row["answer"])))
     return row
 
 

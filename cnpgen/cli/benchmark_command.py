@@ -34,6 +34,12 @@ def add(commands: "Commands[Parser]") -> None:
     option("--n", metavar="N", type=values.positive, help="only the first N problems; of a random suite also more")
     option("--simulate", action="store_true", help="execute the plans, too")
     option("--plant", metavar="NAME", nargs="+", help="the robots that execute them (default: nominal)")
+    option(
+        "--environment",
+        metavar="PATH",
+        type=Path,
+        help="execute them in this clone of the Air Hockey Challenge, too",
+    )
     option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="for each problem (default: 60s)")
     text = "processes that execute, and with --engine plan; default one per available core"
     option("--workers", metavar="W", type=values.positive, help=text)
@@ -52,8 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.suite is None:
         raise UsageError("which suite? 'cnpgen benchmark --list' names them")
-    if arguments.plant and not arguments.simulate:
-        raise UsageError("--plant says which robot executes plans: it goes with --simulate only")
+    if (arguments.plant or arguments.environment) and not arguments.simulate:
+        option = "--plant" if arguments.plant else "--environment"
+        raise UsageError(f"{option} says where plans are executed: it goes with --simulate only")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     report = save_benchmark_report(found, folder / "report.html")
@@ -80,6 +87,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             planners=arguments.planners or FASTEST,
             n=arguments.n,
             plants=(arguments.plant or ("nominal",)) if arguments.simulate else (),
+            environment=arguments.environment,
             time_limit=arguments.time_limit,
             workers=arguments.workers,
             engine=arguments.engine,
@@ -105,7 +113,7 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
         "suite_version": found.suite.version,
         "problems": len(found.problems),
         "folder": str(folder),
-        "planners": {plant or "planned": found.summary(plant) for plant in found.plants or ("",)},
+        "planners": {plant or "planned": found.summary(plant) for plant in found.executions},
     }
 
 
@@ -115,7 +123,7 @@ def _text(found: "Benchmark") -> str:
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
-    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.plants or ("",)]
+    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
     return "\n\n".join([head, *("\n".join(lines) for lines in tables)])
 
 

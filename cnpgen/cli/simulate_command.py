@@ -13,6 +13,7 @@ from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
+    from cnpgen.simulator.plant import Plant
     from cnpgen.simulator.simulate import Simulation
 
 PLANTS = ("nominal", "heavier", "delayed")
@@ -47,7 +48,9 @@ def add(commands: "Commands[Parser]") -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
     option("--problem", metavar="NAME|FILE", help="the problem that they must be for")
-    option("--plant", choices=PLANTS, default="nominal", help=f"the robot: {', '.join(PLANTS)} (default: nominal)")
+    where = parser.add_mutually_exclusive_group().add_argument
+    where("--plant", choices=PLANTS, default="nominal", help=f"the robot: {', '.join(PLANTS)} (default: nominal)")
+    where("--environment", metavar="PATH", type=Path, help="a clone of the Air Hockey Challenge, to execute them there")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="list the plans, too: a line each")
     option("--plan", metavar="I", type=values.natural, default=0, help="the plan to draw (default: 0)")
@@ -67,7 +70,9 @@ def run(arguments: argparse.Namespace) -> int:
     meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
     meter.begin(f"executing {arguments.file}", len(plans))
     try:
-        found = simulate_plans(plans, plant=arguments.plant, workers=arguments.workers, progress=meter)
+        found = simulate_plans(
+            plans, plant=arguments.plant, environment=arguments.environment, workers=arguments.workers, progress=meter
+        )
     finally:
         meter.close()
     if arguments.json:
@@ -77,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(_text(arguments.file, found))
         if arguments.list:
             print("\n" + "\n".join(_lines(found)))
-    _draw(arguments, plans[arguments.plan])
+    _draw(arguments, plans[arguments.plan], found.plant)
     return 0 if all(each.success for each in found.executed) else 1
 
 
@@ -114,14 +119,13 @@ def _lines(found: "Simulation") -> list[str]:
     return lines
 
 
-def _draw(arguments: argparse.Namespace, plan: "Plans") -> None:
+def _draw(arguments: argparse.Namespace, plan: "Plans", plant: "Plant") -> None:
     from cnpgen.simulator.picture import save_film, save_picture
-    from cnpgen.simulator.plant import as_plant
     from cnpgen.simulator.simulate import execute_plan
 
     if not (arguments.image or arguments.video):
         return
-    scene, reference, execution = execute_plan(plan, as_plant(arguments.plant))
+    scene, reference, execution = execute_plan(plan, plant)
     if arguments.image:
         save_picture(Path(arguments.image), scene, execution, reference.ticks)
         print(f"drawn: plan {arguments.plan} in {arguments.image}", file=sys.stderr)

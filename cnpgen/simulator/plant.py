@@ -51,12 +51,14 @@ class Plant:
         title: What is different from what the controller believes, in a line.
         mass: Its masses and inertias are so many times those of the URDF.
         delay: Ticks of the controller, of 1 ms, after which a torque takes effect.
+        environment: The folder of somebody else's environment that executes; empty for cnpgen's own.
     """
 
     name: str
     title: str
     mass: float = 1.0
     delay: int = 0
+    environment: str = ""
 
 
 PLANTS = {

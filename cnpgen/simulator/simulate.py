@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.simulator.execute import Execution, execute, load_mujoco
 from cnpgen.simulator.executed import Executed
 from cnpgen.simulator.hockey import puck_of
@@ -71,6 +73,7 @@ def simulate_plans(
     plans: Plans,
     *,
     plant: Plant | str = "nominal",
+    environment: str | Path | None = None,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Simulation:
@@ -82,17 +85,22 @@ def simulate_plans(
     Args:
         plans: The plans.
         plant: The robot, or its name: "nominal", "heavier" or "delayed".
+        environment: A clone of the Air Hockey Challenge's environment that executes in the place of ``plant``.
         workers: Processes; default one per available core, or one where a second would not pay.
         progress: Called with the number of plans that were executed since the last call.
 
     Raises:
-        UsageError: There is no such plant, or there are fewer than one worker.
+        UsageError: There is no such plant, there are fewer than one worker, or ``environment`` is no such clone or
+            cannot execute such plans.
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
-        MachineError: MuJoCo is missing, or a worker died.
+        MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
     check_plans_type(plans)
     plant, plans = as_plant(plant), settle_tips(plans)
     load_mujoco()
+    if environment is not None:
+        plant = challenge_plant(environment)
+        check_challenge(*open_problem(plans.problem))
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, max(len(plans), 1))
     executed: list[Executed] = []
     with closing(share_out(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:

@@ -16,16 +16,18 @@ from cnpgen.schema import registry
 BAD = """
 import os, time
 from dataclasses import dataclass
+import numpy as np
+from cnpgen import Trajectory
 from cnpgen.benchmark.planner import BenchmarkPlanner
 from cnpgen.benchmark.planners.learned import CNPB
-from cnpgen.plugins import field
+from cnpgen.benchmark.suite import load_suite
 
 @dataclass(frozen=True)
 class Moody(BenchmarkPlanner):
     "Fails in another way at every problem."
 
     def prepare(self, setting):
-        good = CNPB().prepare(setting)
+        good, others = CNPB().prepare(setting), load_suite("hits-81").problems()[0]
         ways = {
             0: lambda problem: os._exit(1),
             1: good,
@@ -34,6 +36,10 @@ class Moody(BenchmarkPlanner):
             4: lambda problem: None,
             5: lambda problem: time.sleep(1000),
             6: good,
+            7: lambda problem: Trajectory(np.array([0, 1.0]), np.zeros((2, 3))),
+            8: lambda problem: problem,
+            9: lambda problem: Trajectory(np.array([0, 1e4]), np.zeros((2, 6))),
+            10: lambda problem: good(others[50]),
         }
         return lambda problem: ways[int(problem.sample_id[0])](problem)
 """
@@ -57,13 +63,30 @@ def test_whatever_a_planner_does_costs_its_own_row_only(
     moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cnpgen.benchmark.process.SPARE", 0.5)
-    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=7, time_limit=0.2)
+    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=11, time_limit=0.2)
     rows = found.results[moody]
     endings = [row["ending"] for row in rows]
-    assert endings == ["crashed", "planned", "failed", "failed", "no plan", "out of time", "planned"]
+    assert endings[:7] == ["crashed", "planned", "failed", "failed", "no plan", "out of time", "planned"]
+    assert endings[7:] == ["failed", "planned", "planned", "planned"]
+    assert rows[7]["error"] == "the problem has 6 joints, its answer 3"
+    assert [row["verdict"]["reason"] for row in rows[8:]] == ["not finite", "too long", "boundary conditions"]
     assert "garbage" in rows[2]["error"]
     assert "ZeroDivisionError" in rows[3]["error"]
-    assert [row["answer"] is not None for row in rows] == [False, True, False, False, False, False, True]
+    assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
+
+
+def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
+    file = tmp_path / "cnp-b.jsonl"
+    lines = file.read_text().splitlines()
+    broken = first.results["cnp-b"][0]
+    broken["answer"]["rate_control_points"][0] = None
+    file.write_text("\n".join([lines[0], json.dumps(broken), *lines[2:]]) + "\n")
+    found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2, plants=["nominal"], workers=1)
+    assert "cannot be executed" in found.results["cnp-b"][0]["executed"]["nominal"]["failure"]
+    report = save_benchmark_report(found, tmp_path / "report.html").read_text()
+    assert "cnp-b, problem 1" in report or "No pictures" in report
 
 
 def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) -> None:

@@ -11,14 +11,15 @@ from scipy.stats import norm
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.cbirrt import Search
-from cnpgen.benchmark.planners.imitation import likelihood_gradient, train_proposals
 from cnpgen.benchmark.planners.mpc_mpnet import MPCMPNet, ProposedExtension
 from cnpgen.benchmark.planners.proposals import (
     LEAST,
     Proposals,
+    likelihood_gradient,
     load_proposals,
     save_proposals,
     shipped_proposals,
+    train_proposals,
 )
 from cnpgen.benchmark.planners.sst import STEP, RandomExtension
 from cnpgen.benchmark.planners.state_check import TABLE, UPRIGHT, StateCheck
@@ -225,6 +226,13 @@ def test_mpc_mpnet_keeps_its_limits_and_gets_away_from_the_start(suite: str) -> 
     tip, goal = task.problem.tip_positions(found.q), task.columns["goal_xyz"][0]
     assert np.linalg.norm(tip[-1] - goal) < np.linalg.norm(tip[0] - goal) - 0.01
     assert np.all(np.abs(found.dq) <= robot.velocity_limit)
+
+
+def test_a_network_of_another_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = "cnpgen.benchmark.planners.mpc_mpnet.shipped_proposals"
+    monkeypatch.setattr(other, lambda _: shipped_proposals("heavy-object"))
+    with pytest.raises(UsageError, match="'airhockey' is of another arm or world"):
+        MPCMPNet().prepare(Setting(one_of("hits-81").problem))
 
 
 def test_mpc_mpnet_goes_on_elsewhere_after_a_step_that_led_nowhere() -> None:

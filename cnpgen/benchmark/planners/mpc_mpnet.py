@@ -1,8 +1,8 @@
 """MPC-MPNet (Li et al., 2021), its variant that follows one path: a tree that is steered to what a network proposes.
 
 From the state that it has just reached, a network proposes where to be next, now and then it is the goal, and the
-cross-entropy method steers there from the best node nearby. Where that fails, or after many steps, it goes on from a
-node near a random place. Controls are accelerations within the torque limits, as those of SST are here; how nodes are
+cross-entropy method steers there. Where that fails, or after many steps, it goes on from a node near a random place.
+Controls are accelerations within the torque limits, as those of SST are here; how nodes are
 kept, distances and the goal, a place of the tip alone, are those of SST, too.
 """
 
@@ -17,6 +17,7 @@ from cnpgen.benchmark.planners.proposals import Proposals, load_proposals, shipp
 from cnpgen.benchmark.planners.state_check import StateCheck
 from cnpgen.benchmark.planners.steering import Steering
 from cnpgen.benchmark.planners.tree import Tree, radii_of
+from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
 
@@ -36,6 +37,10 @@ class MPCMPNet(BenchmarkPlanner):
         problem, robot = open_problem(setting.problem)
         check = StateCheck(problem, robot)
         network = load_proposals(shipped_proposals(problem.name))
+        if network.architecture.inputs != 4 * robot.n + len(problem.obstacle):
+            raise UsageError(
+                f"the network that proposes configurations for {problem.name!r} is of another arm or world"
+            )
         spread = steering.HIT if problem.object_size is None else steering.TRANSPORT
         random = np.random.default_rng(setting.seed)
 

@@ -1,0 +1,194 @@
+"""Execution in a user's clone of the Air Hockey Challenge's environment (2023): another arm, table and controller.
+
+What is used of it are its classes for one iiwa at the table and for its controller of positions at 1 kHz, which takes
+20 ticks of positions, velocities and accelerations at a time.
+"""
+
+import importlib
+import sys
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.simulator.outcome import Seen, puck_is_done
+from cnpgen.simulator.plant import Plant, rated_torque
+from cnpgen.simulator.reference import Reference
+from cnpgen.simulator.scene import Scene
+
+Array = NDArray[np.float64]
+
+MODULE = "air_hockey_challenge.environments.position_control_wrapper"
+JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
+TICKS = 20  # of the controller in one step of the environment
+
+
+def challenge_plant(folder: str | Path) -> Plant:
+    """Return the plant that executes in a clone of the environment.
+
+    Args:
+        folder: The clone: the folder that holds the package ``air_hockey_challenge``.
+
+    Raises:
+        UsageError: It is no such folder.
+        MachineError: The environment cannot be imported or is of another version.
+    """
+    place = Path(folder).resolve()
+    if not (place / MODULE.replace(".", "/")).with_suffix(".py").is_file():
+        wanted = f"{MODULE.replace('.', '/')}.py"
+        raise UsageError(f"{folder} is no clone of the Air Hockey Challenge's environment: it has no {wanted}")
+    plant = Plant("challenge", "the environment of the Air Hockey Challenge", environment=str(place))
+    _environment(plant.environment)
+    return plant
+
+
+def check_challenge(problem: Problem, robot: Robot) -> None:
+    """Refuse problems that are not for an iiwa at the air-hockey table.
+
+    Raises:
+        UsageError: The problem is another one.
+    """
+    table = any(isinstance(each, Table) for each in problem.constraint)
+    if not table or not set(robot.joint_names) <= set(JOINTS):
+        needed = f"a table and an arm with {JOINTS[0]} to {JOINTS[-1]}"
+        raise UsageError(f"the Air Hockey Challenge has {needed}, {problem.name!r} is another problem")
+
+
+def execute_in_challenge(scene: Scene, reference: Reference, start_dq: Array) -> Seen:
+    """Execute one plan there.
+
+    Args:
+        scene: The world; of it the puck, and which joints are planned.
+        reference: What the controller is to follow; the robot begins at its first position.
+        start_dq: The robot's velocities at the start [rad/s], shape (n,).
+
+    Raises:
+        UsageError: The environment gave up.
+        MachineError: It cannot be imported or is of another version.
+    """
+    environment = _environment(scene.plant.environment)
+    try:
+        environment.begin(_all_joints(scene, reference.q[:1])[0], _all_joints(scene, start_dq[None])[0], scene.puck)
+        tick, done = 0, False
+        while not done:
+            done = environment.advance(_action(scene, reference, tick))
+            tick += TICKS
+            done = tick >= reference.ticks and (done or puck_is_done(reference, tick, *environment.puck_state()))
+        environment.record(np.zeros(len(JOINTS)))
+    except RuntimeError as error:  # so it ends where MuJoCo warns of something
+        raise UsageError(f"the Air Hockey Challenge's environment gave up: {error}") from error
+    except (AttributeError, KeyError, TypeError) as error:
+        raise MachineError(f"{scene.plant.environment} is of another version than cnpgen knows: {error}") from error
+    return _seen(scene, reference, environment)
+
+
+def _all_joints(scene: Scene, values: Array) -> Array:
+    """Fill joints that are not planned with zeros, shape (K, 7)."""
+    found = np.zeros((len(values), len(JOINTS)))
+    found[:, [JOINTS.index(name) for name in scene.robot.joint_names]] = values
+    return found
+
+
+def _action(scene: Scene, reference: Reference, tick: int) -> Array:
+    """Return the next 20 positions, velocities and accelerations, shape (20, 3, 7); after the last it holds still."""
+    wanted = np.arange(tick, tick + TICKS)
+    last = len(reference.q) - 1
+    moving, at = (wanted <= last)[:, None], np.minimum(wanted, last)
+    parts = (reference.q[at], reference.dq[at] * moving, reference.ddq[at] * moving)
+    return np.stack([_all_joints(scene, part) for part in parts], axis=1)
+
+
+def _seen(scene: Scene, reference: Reference, environment: Any) -> Seen:
+    """Put together what the environment's recorder saw, in the robot's frame."""
+    import pinocchio as pin
+
+    robot, planned = scene.robot, [JOINTS.index(name) for name in scene.robot.joint_names]
+    q, torque, puck, velocity = (np.array(each) for each in zip(*environment.seen, strict=True))
+    q, data, tips = q[:, planned], robot.model.createData(), []
+    for each in q:
+        pin.framesForwardKinematics(robot.model, data, each)
+        tips.append(data.oMf[robot.tip_frame].copy())
+    wanted = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
+    use = torque[:, planned] / rated_torque(scene.problem, robot)
+    tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
+    return Seen(q, tip, rotation, wanted, use, puck, velocity)
+
+
+@lru_cache(maxsize=1)
+def _environment(folder: str) -> Any:
+    """Import the environment and make one that starts where it is told and records what it does."""
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        control = importlib.import_module(MODULE)
+        iiwas = importlib.import_module("air_hockey_challenge.environments.iiwas")
+    except (ImportError, OSError, SyntaxError) as error:
+        raise MachineError(f"{folder} cannot be imported ({error}): install what its README asks for") from error
+    if not Path(str(control.__file__)).resolve().is_relative_to(folder):
+        raise MachineError(f"{folder} is hidden by another one that is installed: {control.__file__}")
+    try:
+        kind = type("Recorded", (_Recorder, control.PositionControlIIWA, iiwas.AirHockeySingle), {})
+        return kind(interpolation_order=None)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise MachineError(f"{folder} is of another version than cnpgen knows: {error}") from error
+
+
+class _Recorder:
+    """What is laid over the environment's own classes: where it starts, and what was seen at every tick."""
+
+    seen: list[tuple[Array, ...]]
+    _start: Array
+
+    def begin(self: Any, q: Array, dq: Array, puck: Array) -> None:
+        """Begin anew: positions and velocities of the arm, shape (7,), and a puck that lies still [m], shape (2,)."""
+        self.seen, self._start = [], dq
+        self._frame = np.array(self.env_info["robot"]["base_frame"][0])
+        self._puck = (self._frame @ [*puck, 0.0, 1.0])[:2]
+        self.init_state = q
+        self.reset()
+
+    def setup(self: Any, obs: Any) -> None:
+        """As the environment calls it in ``reset``."""
+        for axis, value in zip("xy", self._puck.tolist(), strict=True):
+            self._write_data(f"puck_{axis}_pos", value)
+        for name, speed in zip(JOINTS, self._start.tolist(), strict=True):
+            self._data.joint(f"iiwa_1/{name}").qvel = speed
+        super().setup(obs)  # type: ignore[misc]
+
+    def advance(self: Any, action: Array) -> bool:
+        """Take one step; return whether the environment says that it is over."""
+        _, _, over, _ = self.step(action)
+        return bool(over)
+
+    def reward(self, *_: Any) -> float:
+        """Nothing is rewarded."""
+        return 0.0
+
+    def puck_state(self: Any) -> tuple[float, float]:
+        """Return where the puck is along the table [m] and how fast it is [m/s]."""
+        puck, velocity = self._puck_seen()
+        return float(puck[0]), float(np.linalg.norm(velocity))
+
+    def _compute_action(self: Any, obs: Any, action: Any) -> Any:
+        """As the environment calls it at every tick."""
+        torque = super()._compute_action(obs, action)  # type: ignore[misc]
+        self.record(np.array(torque))
+        return torque
+
+    def record(self: Any, torque: Array) -> None:
+        """Record what there is, and the torques that take effect now [N m], shape (7,)."""
+        q = np.array([float(np.squeeze(self._data.joint(f"iiwa_1/{name}").qpos)) for name in JOINTS])
+        self.seen.append((q, torque, *self._puck_seen()))
+
+    def _puck_seen(self: Any) -> tuple[Array, Array]:
+        """Return the puck's position [m] and velocity [m/s] in the robot's frame, shape (2,) each."""
+        place = [float(np.squeeze(self._read_data(f"puck_{axis}_pos"))) for axis in "xy"]
+        velocity = [float(np.squeeze(self._read_data(f"puck_{axis}_vel"))) for axis in "xy"]
+        rotation = self._frame[:3, :3].T
+        return (rotation @ ([*place, 0.0] - self._frame[:3, 3]))[:2], (rotation @ [*velocity, 0.0])[:2]

@@ -1,0 +1,117 @@
+"""Execution in a clone of the Air Hockey Challenge's environment: with a stand-in that has its interface."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.benchmark.report import save_benchmark_report
+from cnpgen.benchmark.run import run_benchmark
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.plans import Plans, save_plans
+from cnpgen.refine.plans import solve_plans
+from cnpgen.simulator.challenge import challenge_plant
+from cnpgen.simulator.simulate import execute_plan, simulate_plans
+
+pytest.importorskip("mujoco")
+CLONE = Path(__file__).parents[1] / "examples" / "challenge"
+
+
+@pytest.fixture(scope="module")
+def plans() -> Plans:
+    return solve_plans(draw_boundary_problems("airhockey-pucks", 2, seed=1), workers=1).plans
+
+
+def test_plans_are_executed_there_with_the_same_outcome_up_to_the_controllers(plans: Plans) -> None:
+    there, here = simulate_plans(plans, environment=CLONE, workers=1), simulate_plans(plans, workers=1)
+    assert there.plant.name == "challenge"
+    for a, b in zip(there.executed, here.executed, strict=True):
+        assert a.success
+        assert b.success
+        assert a.hit_time == pytest.approx(b.hit_time, abs=0.005)
+        assert a.puck_speed == pytest.approx(b.puck_speed, rel=0.05)
+        assert 0 < a.tracking_error < 0.02
+        assert a.tracking_error != b.tracking_error
+        assert a.z_error == pytest.approx(b.z_error, abs=1e-4)
+        assert 0.1 < a.torque_use < 1
+
+
+def test_the_puck_and_the_arm_are_seen_in_the_robots_frame(plans: Plans) -> None:
+    scene, reference, found = execute_plan(plans[0], challenge_plant(CLONE))
+    assert scene.puck is not None
+    np.testing.assert_allclose(found.puck[0], scene.puck, atol=1e-12)
+    np.testing.assert_allclose(found.states[0, :6], reference.q[0], atol=1e-12)
+    at_the_hit = found.tip[reference.ticks - 1]
+    assert np.linalg.norm(at_the_hit - plans.columns["goal_xyz"][0]) < 0.002
+
+
+def test_a_benchmark_executes_there_too(tmp_path: Path) -> None:
+    found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, environment=CLONE, workers=1)
+    assert found.executions == ("challenge",)
+    assert found.results["cnp-b"][0]["executed"]["challenge"]["success"]
+    assert "executed by the challenge plant" in save_benchmark_report(found, tmp_path / "report.html").read_text()
+
+
+def test_the_command_line_executes_there_and_refuses_what_is_no_clone(plans: Plans, tmp_path: Path) -> None:
+    save_plans(tmp_path / "plans.h5", plans[:1])
+
+    def run(folder: Path) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "cnpgen", "simulate", str(tmp_path / "plans.h5"), "--environment", str(folder)]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    done = run(CLONE)
+    assert done.returncode == 0, done.stderr
+    assert "executed by the challenge plant" in done.stdout
+    refused = run(tmp_path)
+    assert refused.returncode == 2
+    assert "no clone of the Air Hockey Challenge" in refused.stderr
+    assert "position_control_wrapper.py" in refused.stderr
+
+
+def clone(folder: Path, **files: str) -> Path:
+    """A clone with some files changed; their names without the folder of environments."""
+    shutil.copytree(CLONE, folder)
+    for name, text in files.items():
+        (folder / "air_hockey_challenge" / "environments" / f"{name}.py").write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"position_control_wrapper": "import mushroom_rl_that_is_missing"}, "cannot be imported"),
+        ({"position_control_wrapper": "class PositionControlIIWA: pass"}, "of another version"),
+        ({"iiwas": "class AirHockeyIIWA: pass"}, "of another version"),
+    ],
+)
+def test_a_clone_that_cannot_be_used_is_told_of(files: dict[str, str], said: str, tmp_path: Path) -> None:
+    """In a process of its own: modules of one name are imported once."""
+    folder = clone(tmp_path / "clone", **files)
+    code = f"""
+from cnpgen.errors import MachineError
+from cnpgen.simulator.challenge import challenge_plant
+try:
+    challenge_plant({str(folder)!r})
+except MachineError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said in done.stdout
+
+
+def test_another_clone_that_is_already_imported_is_not_mistaken_for_it(tmp_path: Path) -> None:
+    challenge_plant(CLONE)
+    with pytest.raises(MachineError, match="hidden by another one"):
+        challenge_plant(clone(tmp_path / "clone"))
+    challenge_plant(CLONE)
+
+
+def test_other_problems_than_hits_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"the Air Hockey Challenge has a table .* 'heavy-object' is another problem"):
+        simulate_plans(draw_boundary_problems("heavy-object", 1, seed=0), environment=CLONE)
+    with pytest.raises(UsageError, match="is another problem"):
+        run_benchmark("heavy-100", tmp_path, planners=["cnp-b"], n=1, environment=CLONE)
