@@ -34,7 +34,7 @@ class RecipeError(CnpgenError):
 
 
 class PluginError(RecipeError):
-    """A recipe needs stages or constraints of packages that are not installed here."""
+    """A recipe needs stages, constraints or robots of packages that are not installed here."""
 
     exit_code = 3
 

@@ -80,7 +80,8 @@ for name in cnpgen.__all__:
     getattr(cnpgen, name)
 for name in cnpgen.list_recipes("dataset"):
     recipe = cnpgen.load_dataset_recipe(name)
-    assert recipe.pipeline.problem.urdf_path.is_relative_to(sys.argv[1])
+    if name not in ("panda-cup", "ur5-wipe"):  # whose robots an extra installs
+        assert recipe.pipeline.problem.urdf_path.is_relative_to(sys.argv[1])
 (script,) = entry_points(group="console_scripts", name="cnpgen")
 assert callable(script.load())
 print(version("cnpgen"), len(cnpgen.list_recipes("dataset")))

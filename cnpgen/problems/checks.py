@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import PluginError, RecipeError, nearest
 from cnpgen.robots.shape.files import find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
@@ -35,8 +35,7 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
         return
     try:
         path = find_urdf(urdf, folder / "problem.toml", named_packages(robot, folder))
-    except RecipeError as error:
-        yield (where / "urdf").says(str(error))
+    except PluginError:  # without its robot a problem can be listed; whoever loads the robot says what is missing
         return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])

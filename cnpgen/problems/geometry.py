@@ -30,10 +30,16 @@ def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
 
 def geometry_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
     """Say what in a problem file does not go with the shape of its robot."""
+    elements = _collision_elements(table, folder)
     if chosen_geometry(table, folder) != "urdf":
         yield from _paper_mistakes(table, where)
-        return
-    elements = _collision_elements(table, folder)
+    elif elements is not None:
+        yield from _shape_mistakes(table, where, folder, elements)
+
+
+def _shape_mistakes(
+    table: dict[str, Any], where: Place, folder: Path, elements: list[ElementTree.Element]
+) -> Iterator[str]:
     if not elements:
         text = "its links have no <collision> elements, so that it has no shape"
         yield (where / "robot" / "geometry").says(f"the URDF gives no shape: {text}; {_NAME_IT}")
@@ -75,16 +81,16 @@ def _missing_files(
         yield (where / "srdf").says(f"no such file: {folder / srdf}")
 
 
-def _collision_elements(table: dict[str, Any], folder: Path) -> list[ElementTree.Element]:
-    """List the collision elements of the URDF; none if it cannot be read, which is reported elsewhere."""
+def _collision_elements(table: dict[str, Any], folder: Path) -> list[ElementTree.Element] | None:
+    """List the collision elements of the URDF; None if it cannot be read, which is reported elsewhere."""
     urdf = _robot(table).get("urdf")
     if not isinstance(urdf, str):
-        return []
+        return None
     try:
         path = find_urdf(urdf, folder / "problem.toml", named_packages(_robot(table), folder))
         tree = urdf_tree(read_urdf(path))
     except (RecipeError, ValueError):
-        return []
+        return None
     return list(tree.iterfind("link/collision"))
 
 

@@ -86,7 +86,7 @@ class Problem:
         """The URDF file.
 
         Raises:
-            RecipeError: It is one of a package that is not there.
+            PluginError: It is one of a package that is not here.
         """
         return find_urdf(self.robot.urdf, self.path, self._packages)
 

@@ -28,6 +28,7 @@ def load_robot(problem: Problem) -> Robot:
 
     Raises:
         RecipeError: The URDF cannot be read, or joints, tip, base configuration and limits do not fit it.
+        PluginError: The URDF is one of a package that is not here.
     """
     spec, limits = problem.robot, problem.limits
     try:
@@ -41,7 +42,7 @@ def load_robot(problem: Problem) -> Robot:
         acceleration = _given(limits.acceleration, "acceleration", most)
         jerk = _given(limits.jerk, "jerk", JERK_RATE * acceleration)
     except RecipeError as error:
-        raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
+        raise type(error)([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
     middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
     robot = Robot(

@@ -286,20 +286,25 @@ def _check_cache(found: _Findings, cache: str) -> bool:
 def _check_recipes(found: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
+        from cnpgen.errors import PluginError
         from cnpgen.make.load import load_dataset_recipe
         from cnpgen.problems.robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root
 
-        names = list(list_recipes("dataset"))
+        names, without = list(list_recipes("dataset")), []
         for name in names:
-            load_robot(load_dataset_recipe(name).pipeline.problem)
+            try:
+                load_robot(load_dataset_recipe(name).pipeline.problem)
+            except PluginError:
+                without.append(name)
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
         found.problems += [] if found.problems else [f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen"]
         return f"cannot be loaded: {text}"
     if not names:
         found.problems.append(f"there are no recipes in {recipes_root()}: reinstall cnpgen")
-    return f"{len(names)} datasets in {recipes_root()}, their robots load"
+    more = f", but for those of {', '.join(without)}: pip install 'cnpgen[robots]'" if without else ""
+    return f"{len(names)} datasets in {recipes_root()}, their robots load{more}"
 
 
 def _check_disk(found: _Findings) -> int:

@@ -21,6 +21,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
+from tests.examples.example_robots import with_robots
 from tests.examples.shaped_robot import write_problem
 
 
@@ -52,7 +53,7 @@ def test_the_numbers_of_a_constraint_have_units():
         assert part in text
 
 
-@pytest.mark.parametrize("name", list(list_recipes("dataset")))
+@pytest.mark.parametrize("name", with_robots(list_recipes("dataset")))
 def test_a_dataset_is_described_with_everything_it_refers_to(name):
     recipe = load_dataset_recipe(name)
     text = describe(recipe)

@@ -1,7 +1,9 @@
 """Where the robots of the package example-robot-data are, if it is installed; and a Panda between two shelves."""
 
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,6 +20,13 @@ def folder() -> Path | None:
 
 
 needs_robots = pytest.mark.skipif(folder() is None, reason="example-robot-data is not installed")
+SHIPPED = ("panda-cup", "ur5-wipe")  # problems, pipelines and datasets of these robots
+
+
+def with_robots(names: Iterable[str]) -> list[Any]:
+    """The names of recipes as parameters of a test, those of robots that are not installed to be skipped."""
+    return [pytest.param(name, marks=needs_robots) if name in SHIPPED else name for name in names]
+
 
 PANDA = """
 name = "panda-shelves"

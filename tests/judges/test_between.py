@@ -1,4 +1,4 @@
-"""Joint positions, velocities and accelerations as polynomials: the same functions, and their largest values."""
+"""Joint positions, velocities, accelerations and jerks as polynomials: the same functions, and their largest values."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ def value(coefficients: np.ndarray, edges: np.ndarray, s: np.ndarray) -> np.ndar
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
 def test_polynomials_are_the_motion(label: str) -> None:
     plan = bent(load(label), 0.05, seed=1)
-    pieces, exact = polynomials(plan.motion), course(plan)
-    for name in ("q", "dq", "ddq"):
+    pieces, exact = polynomials(plan.motion, jerk=True), course(plan)
+    for name in ("q", "dq", "ddq", "jerk"):
         found, wanted = value(getattr(pieces, name), pieces.edges, exact.s), getattr(exact, name).T
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
 
@@ -25,8 +25,9 @@ def test_polynomials_are_the_motion(label: str) -> None:
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
 @pytest.mark.parametrize("seed", range(5))
 def test_the_largest_value_is_that_of_a_very_fine_grid(label: str, seed: int) -> None:
-    pieces = polynomials(bent(load(label), 0.05, seed=seed).motion)
-    rows = pieces.ddq / np.abs(pieces.ddq).max() * 3
+    pieces = polynomials(bent(load(label), 0.05, seed=seed).motion, jerk=True)
+    values = pieces.ddq if seed % 2 else pieces.jerk
+    rows = values / np.abs(values).max() * 3
     found, row, s = largest(rows, pieces.edges)
     grid = value(rows, pieces.edges, np.linspace(0, 1, 20001))
     assert grid.max() - ROUGH <= found <= grid.max() + 1e-5  # the grid's own gaps

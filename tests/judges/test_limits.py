@@ -8,9 +8,10 @@ import pytest
 from cnpgen.judges.plans.limits import is_proven
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque
 from tests.conftest import some
+from tests.examples.jerky import jerky_plan
 from tests.examples.plans import Plan, bent, course, load
 
-NAMES = {"position": "q", "velocity": "dq", "acceleration": "ddq"}
+NAMES = {"position": "q", "velocity": "dq", "acceleration": "ddq", "jerk": "jerk"}
 
 
 def beyond(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -21,7 +22,7 @@ def beyond(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.ndarra
         return np.maximum(robot.position_lower[:, None] - values, values - robot.position_upper[:, None]), np.ones(
             robot.n
         )
-    limit = {"velocity": robot.velocity_limit, "acceleration": robot.acceleration_limit}[quantity]
+    limit = getattr(robot, f"{quantity}_limit")
     return np.abs(values) - limit[:, None], limit
 
 
@@ -29,7 +30,7 @@ def beyond(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("quantity", NAMES)
 @pytest.mark.parametrize("by", some([0.2, 0.0]))
 def test_the_margin_of_a_limit_is_the_worst_of_a_very_fine_grid(label: str, quantity: str, by: float) -> None:
-    plan = bent(load(label), by, seed=2)
+    plan = bent(jerky_plan(label), by, seed=2)
     margin = plan.judged().margins[f"joint {quantity}"]
     found, scale = beyond(plan, quantity, 20001)
     joint = int(np.argmax((found / scale[:, None]).max(axis=1)))
@@ -41,13 +42,14 @@ def test_the_margin_of_a_limit_is_the_worst_of_a_very_fine_grid(label: str, quan
 
 def test_what_lies_between_moments_counts() -> None:
     """A plan is called valid by no step if its acceleration is beyond what is allowed for a thousandth of a second."""
-    plan = bent(load("replan"), 0.05, seed=3)
-    found, scale = beyond(plan, "acceleration", 200_001)
-    worst = (found / scale[:, None]).max()
-    for more, wanted in ((1e-6, False), (-1e-6, True)):
-        judged = plan.with_constraint("JointAcceleration", tolerance=worst - more)
-        for step in (1e-2, 1e-3):
-            assert judged.judged(step=step).margins["joint acceleration"].ok is wanted
+    plan = bent(jerky_plan("replan"), 0.05, seed=3)
+    for quantity in ("acceleration", "jerk"):
+        found, scale = beyond(plan, quantity, 200_001)
+        worst = (found / scale[:, None]).max()
+        for more, wanted in ((1e-6, False), (-1e-6, True)):
+            judged = plan.with_constraint(f"Joint{quantity.capitalize()}", tolerance=worst - more)
+            for step in (1e-2, 1e-3):
+                assert judged.judged(step=step).margins[f"joint {quantity}"].ok is wanted
 
 
 def test_a_limit_that_was_changed_by_a_package_is_sampled_and_not_taken_for_ours() -> None:

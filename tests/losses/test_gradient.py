@@ -8,6 +8,7 @@ import pytest
 
 from cnpgen.losses.plan_loss import LossValue, PlanLoss
 from cnpgen.schema.keys import Range
+from tests.examples.jerky import jerky
 from tests.examples.losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
 from tests.examples.manifolds import LIMITS, MANIFOLDS, problem_on
 from tests.examples.plans import PROBLEMS
@@ -70,6 +71,16 @@ def test_the_gradient_of_every_manifold_is_that_of_central_differences(name):
         value = given.evaluated(of, weights=weights_of(of, term))
         assert (value.terms[:, of.terms.index(term)] > 0).any()
         check_along_random_directions(given, of, value, random, weights=weights_of(of, term))
+
+
+@pytest.mark.parametrize("label", ["hit", "transport"])
+def test_the_gradient_of_limited_jerks_is_that_of_central_differences(label):
+    of = PlanLoss(jerky(PROBLEM_OF[label])[0], dtype="float64", backend="numpy", nodes=16)
+    given, random = batch(label, 3, by=0.3, seed=1), np.random.default_rng(3)
+    term = of.terms.index("joint-jerk")
+    value = given.evaluated(of, weights=weights_of(of, "joint-jerk"))
+    assert (value.terms[:, term] > 0).all()
+    check_along_random_directions(given, of, value, random, weights=weights_of(of, "joint-jerk"))
 
 
 @pytest.mark.parametrize("start", [0.163, 0.19], ids=["in the band", "beyond it"])

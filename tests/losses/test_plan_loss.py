@@ -17,6 +17,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.motion import Motion
 from tests.conftest import needs_compiler
+from tests.examples.jerky import jerky
 from tests.examples.losses import PROBLEM_OF, Batch, batch, huber, loss, states, step_losses
 from tests.examples.plans import PROBLEMS
 
@@ -67,6 +68,24 @@ def test_joint_positions_beyond_their_limits_cost_what_the_paper_says():
         at, robot = states(given.path[k], given.rate[k], s), of._robot
         beyond = np.maximum(robot.position_lower - at.q, 0) + np.maximum(at.q - robot.position_upper, 0)
         assert found == pytest.approx((weights / at.rate) @ huber(beyond).sum(axis=1), rel=1e-10)
+        assert found > 0
+
+
+@pytest.mark.parametrize("rule", ["cosine", "gauss"])
+def test_jerks_beyond_their_limits_cost_what_scipys_splines_say(rule):
+    """One finite difference of an acceleration is all that is known of a jerk here."""
+    problem, robot = jerky("airhockey")
+    of, given = PlanLoss(problem, dtype="float64", backend="numpy", rule=rule, nodes=16), beside("hit")
+    assert of.terms[-1] == "joint-jerk"
+    value, plain = given.evaluated(of), given.evaluated(loss("airhockey", rule=rule, nodes=16))
+    np.testing.assert_allclose(value.terms[:, :-1], plain.terms, rtol=1e-10)
+    s, weights = quadrature(rule, 16)
+    for k, found in enumerate(value.terms[:, -1]):
+        at, h = states(given.path[k], given.rate[k], s), 1e-7
+        after, before = (states(given.path[k], given.rate[k], s + step).ddq for step in (h, -h))
+        jerk = (after - before) / (2 * h) * at.rate[:, None]
+        beyond = np.maximum(np.abs(jerk) - robot.jerk_limit, 0)
+        assert found == pytest.approx((weights / at.rate) @ huber(beyond).sum(axis=1), rel=1e-5)
         assert found > 0
 
 

@@ -20,6 +20,7 @@ from cnpgen.trajectory.spline import chebyshev
 from cnpgen.world.state import World
 from tests.conftest import columns_of
 from tests.examples.constraints import TipSpeed
+from tests.examples.jerky import jerky
 from tests.examples.models import boundary_of_columns, interpreted, surroundings_of, untrained_model
 from tests.examples.plans import KNOTS
 
@@ -153,6 +154,25 @@ def test_a_motion_that_is_none_touches_no_other(fast):
     np.testing.assert_array_equal(
         np.delete(slowing.factor(broken, tops), 3), np.delete(slowing.factor(motion, tops), 3)
     )
+
+
+def test_slowed_motions_keep_limited_jerks_and_slightly_faster_ones_do_not(fast, tmp_path):
+    _, _, _, motion, tops = fast
+    problem, robot = jerky("heavy-object", 2.0)
+    slowing = make_slowing(problem, robot, problem_kernels(problem, robot, "numpy", tmp_path))
+    assert slowing.cubic.tolist() == [False] * (len(slowing.cubic) - 7) + [True] * 7
+    factor = slowing.factor(motion, tops)
+    needed = (factor > 1.01) & (factor < SLOWEST)
+
+    def worst(factor: np.ndarray) -> np.ndarray:
+        jerk = motion.slower(factor).at(chebyshev(PHASES)).jerk / robot.jerk_limit
+        return np.abs(jerk).max(axis=(1, 2))
+
+    alone = np.cbrt(worst(np.ones(12)))  # what jerks alone ask for
+    by_jerk = needed & np.isclose(factor, alone * (1 + 2e-4), rtol=1e-9)
+    assert by_jerk.sum() > 2
+    assert (worst(factor)[factor < SLOWEST] <= 1).all()
+    assert (worst(factor * 0.99)[by_jerk] > 1).all()
 
 
 def test_motions_within_their_limits_are_left_as_they_are(fast):

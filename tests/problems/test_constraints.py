@@ -14,7 +14,7 @@ import pytest
 from cnpgen.problems.constraints.axis import Axis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.constraints.line import Line
 from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
 from cnpgen.problems.constraints.plane import Plane
@@ -150,7 +150,8 @@ def values(form: tuple[Condition, ...]) -> np.ndarray:
 
 def test_every_shipped_kind_is_tested_here():
     built_in = [name for name in names(CONSTRAINTS) if load(CONSTRAINTS, name).__module__.startswith("cnpgen.")]
-    kinds = {name: type(kind) for name, kind in KINDS.items()} | {"self-clearance": SelfClearance}  # test_shapes.py
+    elsewhere = {"self-clearance": SelfClearance, "joint-jerk": JointJerk}  # test_shapes.py, test_jerk.py
+    kinds = {name: type(kind) for name, kind in KINDS.items()} | elsewhere
     assert {name: load(CONSTRAINTS, name) for name in built_in} == kinds
 
 

@@ -11,6 +11,7 @@ from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
 Array = NDArray[np.float64]
 NODES = 4  # Gauss nodes per cell of the time integral: wrong by less than 1e-9 of it
 CRITERION_NODES = 40
+BEGINNING = 1e-6  # a phase as good as 0, where jerks differ by some percent from those at the next point of a grid
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Grid:
     """A grid on (0, 1].
 
     Attributes:
-        s: Phases, shape (K,); s = 0 is left out, nothing can be changed there.
+        s: Phases, shape (K,); s = 0 is left out, nothing but the jerk can be changed there.
         bases: Bases there, three orders of p and two of r, or four and three where the jerk is constrained.
         gauss: Basis of r at the nodes of the time integral, shape (Q, R).
         weights: Quadrature weights of the time integral, shape (Q,).
@@ -69,7 +70,7 @@ class Grid:
 
 def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
     """Build the Chebyshev grid of ``points`` phases, with bases of so many orders of p."""
-    s = chebyshev(points)[1:]
+    s = np.concatenate([[BEGINNING] * (orders > 3), chebyshev(points)[1:]])
     edges = graded_edges(spec.rate_control_points, spec.degree)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     width = np.diff(edges)[:, None]

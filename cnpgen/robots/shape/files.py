@@ -6,7 +6,7 @@ from importlib import metadata
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import PluginError, RecipeError
 
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
@@ -22,9 +22,14 @@ def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
         packages: Folders that it names.
 
     Raises:
-        RecipeError: No package has it; with every place that was looked at.
+        PluginError: It is one of a package that is not here; with every place that was looked at.
     """
-    return _find(name, problem, packages) if urlparse(name).scheme in _PACKAGE else problem.parent / name
+    if urlparse(name).scheme not in _PACKAGE:
+        return problem.parent / name
+    try:
+        return _find(name, problem, packages)
+    except RecipeError as error:
+        raise PluginError(error.mistakes) from None
 
 
 def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Path:

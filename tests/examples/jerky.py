@@ -1,0 +1,35 @@
+"""The shipped problems with jerks that are limited, and their stored plans in them."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from cnpgen.problems.constraints.joint import JointJerk
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.keys import PerJoint
+from tests.examples.plans import PROBLEMS, Plan, load
+
+RATE = 20.0  # 1/s: jerk limits / acceleration limits; the limits of every joint differ a little
+
+
+@cache
+def jerky(name: str, rate: float = RATE) -> tuple[Problem, Robot]:
+    """A shipped problem with limited jerks, and its robot."""
+    robot = load_robot(PROBLEMS[name])
+    limits = rate * robot.acceleration_limit * (1 + 0.01 * np.arange(robot.n))
+    problem = replace(
+        PROBLEMS[name],
+        limits=replace(PROBLEMS[name].limits, jerk=PerJoint(tuple(limits.tolist()))),
+        constraint=(*PROBLEMS[name].constraint, JointJerk(tolerance=0.01)),
+    )
+    return problem, load_robot(problem)
+
+
+def jerky_plan(label: str) -> Plan:
+    """A stored plan, as one of the problem with limited jerks: it exceeds them by far."""
+    plan = load(label)
+    problem, robot = jerky(plan.problem.name)
+    return replace(plan, problem=problem, robot=robot)
