@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.state import HeldState, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -22,35 +22,35 @@ def stage_values(robot: "Robot", problem: Problem) -> Any:
     """Build ``(w, tops) -> g`` with ``w = (p, p', p'', r, r')``: all residuals at one phase."""
     import casadi as ca
 
-    w_sx, tops_sx, g = _stage(robot, problem)
-    return ca.Function("stage_values", [w_sx, tops_sx], [ca.vertcat(*g)])
+    columns, state, g = _stage(robot, problem)
+    return ca.Function("stage_values", columns, state.released([ca.vertcat(*g)]))
 
 
 def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
     """Build ``(w, tops) -> (g, dg/dw)``, the Jacobian column by column."""
     import casadi as ca
 
-    w_sx, tops_sx, g = _stage(robot, problem)
+    columns, state, g = _stage(robot, problem)
     residuals = ca.vertcat(*g)
-    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
-    outputs = ca.cse([residuals, ca.vec(jacobian)])
-    return ca.Function("stage_jacobian", [w_sx, tops_sx], outputs)
+    jacobian = ca.densify(ca.jacobian(residuals, columns[0]))
+    outputs = ca.cse(state.released([residuals, ca.vec(jacobian)]))
+    return ca.Function("stage_jacobian", columns, outputs)
 
 
-def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
+def _stage(robot: "Robot", problem: Problem) -> tuple[list[Any], HeldState, list[Any]]:
     n = robot.n
     (w_sx, w), (tops_sx, tops) = symbols("w", 3 * n + 2), symbols("tops", count_numbers(problem.obstacle))
     p, p1, p2, r, r1 = w[:n], w[n : 2 * n], w[2 * n : 3 * n], w[3 * n], w[3 * n + 1]
     dq = [a * r for a in p1]
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
     size = problem.object_size
-    state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, size)
+    state = HeldState(robot, p, dq, ddq, tops, problem.obstacle, size)
     g = []
     for constraint in problem.constraint:
         for condition in constraint.symbolic(state):
             scales = residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
             g += [value / float(scale) for value, scale in zip(condition.g, scales, strict=True)]
-    return w_sx, tops_sx, g
+    return [w_sx, tops_sx], state, g
 
 
 def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> Array:
