@@ -12,7 +12,9 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.robot import load_robot
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 
@@ -77,7 +79,7 @@ def describe_problem(problem: Problem) -> str:
     facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
     facts += [("object", numbers(problem.object))] if problem.object else []
     facts += [("payload", numbers(problem.payload))] if problem.payload else []
-    facts += [("obstacle", f"{box.name}: {numbers(box, leave_out=('name',))}") for box in problem.obstacle]
+    facts += [("obstacle", f"{each.name}: {_obstacle(each)}") for each in problem.obstacle]
     facts += [("motion", numbers(problem.trajectory))]
     objective = numbers(problem.objective)
     facts += [("objective", f"shortest time, and {objective}" if objective else "shortest time")]
@@ -98,6 +100,15 @@ def describe_problem(problem: Problem) -> str:
             *table(constraints or [("none", "")], indent="    "),
         ]
     )
+
+
+def _obstacle(obstacle: Obstacle) -> str:
+    """List what an obstacle is; of a mesh, which is in it, the number of its corners."""
+    same = [key.name for key in keys(Obstacle) if getattr(obstacle, key.name) == key.default]
+    text = numbers(obstacle, leave_out=("name", "mesh", *same))
+    if not obstacle.mesh:
+        return text
+    return f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners"
 
 
 def _shape(robot: Robot) -> list[str]:

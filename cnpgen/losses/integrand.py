@@ -5,7 +5,7 @@ functions) and the quadrature weight of the node.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.kernels.tape import Axes, GridSpec
@@ -14,7 +14,7 @@ from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import SymbolicState, jerk_along
+from cnpgen.symbolic.state import HeldState, SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -34,32 +34,13 @@ def wider_argument(problem: Problem) -> int:
 
 
 @dataclass(frozen=True)
-class HeldState(SymbolicState):
-    """A state whose held values are symbols until the derivatives are built.
-
-    Attributes:
-        held: Pairs of a symbol and the value that it stands for.
-    """
-
-    held: list[tuple[Any, Any]] = field(default_factory=list)
-
-    def hold(self, value: Any) -> Any:
-        """Return a symbol for a value, so that derivatives pass it by."""
-        import casadi as ca
-
-        symbol = ca.SX.sym(f"held_{len(self.held)}")
-        self.held.append((symbol, value))
-        return symbol
-
-
-@dataclass(frozen=True)
 class Inputs:
     """The arguments of the kernels as SX columns, in order; ``grid_specs`` says what they vary over.
 
     Attributes:
         path: p, p' and p'' [rad], n each; p''', too, where the jerk is constrained.
         rate: r and r' [1/s], and r'' where the jerk is constrained.
-        tops: Heights of the obstacles [m].
+        tops: The numbers of the obstacles.
         wider: How much wider than their bounds the conditions of constraints with a funnel are, in their units.
         node: The quadrature weight.
         tightening: For every constraint the factor of its limits, then for every one the inset of its other bounds.
@@ -85,7 +66,7 @@ def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
-    return ca.Function("loss_values", inputs.columns, ca.cse(_released(state, [_stacked(inputs, terms)])))
+    return ca.Function("loss_values", inputs.columns, ca.cse(state.released([_stacked(inputs, terms)])))
 
 
 def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
@@ -101,7 +82,7 @@ def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
     total = sum(weight * term.value for weight, term in zip(weights, terms, strict=True))
     back[width] -= step / inputs.rate[0] * total  # the factor 1 / r
     parts = [back[first : first + n] for first in range(0, width, n)]
-    results = _released(state, [_stacked(inputs, terms), *parts, back[width:]])
+    results = state.released([_stacked(inputs, terms), *parts, back[width:]])
     return ca.Function("loss_gradient", inputs.columns, ca.cse(results))
 
 
@@ -146,12 +127,3 @@ def _stacked(inputs: Inputs, terms: list[Term]) -> Any:
     import casadi as ca
 
     return ca.vertcat(*[inputs.node / inputs.rate[0] * term.value for term in terms])
-
-
-def _released(state: HeldState, results: list[Any]) -> list[Any]:
-    """Put held values back in place of their symbols."""
-    import casadi as ca
-
-    symbols, values = [symbol for symbol, _ in state.held], [value for _, value in state.held]
-    released: list[Any] = ca.substitute(results, symbols, values) if symbols else results
-    return released

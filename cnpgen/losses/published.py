@@ -14,7 +14,7 @@ from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.symbolic.linalg import add, dot, scale, subtract
-from cnpgen.symbolic.solids import BoxForm, symbolic_solids
+from cnpgen.symbolic.solids import UprightForm, symbolic_solids
 from cnpgen.symbolic.state import SymbolicState, Vec, forward_kinematics
 
 APART = 0.1  # m: no point on the robot is further than this from its neighbour
@@ -30,7 +30,7 @@ def published(constraint: Constraint, state: SymbolicState) -> tuple[Condition, 
 
     if isinstance(constraint, Vertical):
         return _zero("orientation", "1", 1 - state.kinematics.rotation[2][2])
-    boxes = [solid.bounds for solid in symbolic_solids(state) if isinstance(solid, BoxForm) and solid.rotation is None]
+    boxes = [solid.bounds for solid in symbolic_solids(state) if isinstance(solid, UprightForm)]
     if len(boxes) < len(state.obstacles):
         return constraint.penalised(state)
     if isinstance(constraint, RobotClearance) and (radius := constraint.radius) is not None:

@@ -1,8 +1,9 @@
 """Signed distances of the robot's capsules and of the held object from obstacles, as SX: one form per kind.
 
 Sizes and poses are scalars: inputs of kernels. Nothing is called further away than it is. Distances of segments from
-boxes, spheres and capsules are exact, from cylinders by 1e-3 of the segment, and the depth in a cylinder is that of the
-deepest point; meshes are within a box and behind planes.
+boxes, spheres and capsules are exact, from cylinders nearly so; meshes are within a box and behind planes. Where a
+segment itself is inside, the depth is that of one of its points: in a cylinder the deepest one, in a box with a pose
+the middle of what is inside.
 """
 
 from abc import ABC, abstractmethod
@@ -14,6 +15,7 @@ from cnpgen.robots.shape.hull import supporting_planes
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.robots.solid import number_slices
 from cnpgen.symbolic.boxes import (
+    ENDLESS,
     Bounds,
     segment_box_distance,
     segment_box_separation,
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 Size = tuple[float, float, float]
 Hold = Callable[[Scalar], Scalar]
 
-HALVINGS = 10  # of a segment, after which its point nearest to a cylinder is known
+HALVINGS = 8  # of a segment, after which its point nearest to a cylinder is known
 PARALLEL = 1e-12  # of the sine squared of an angle: edges that are closer to parallel have no common normal
 
 
@@ -38,22 +40,22 @@ class SymbolicSolid(ABC):
     """An obstacle as solvers see it."""
 
     @abstractmethod
-    def separation(self, first: Vec, second: Vec) -> Scalar:
-        """Signed distance of a segment from the obstacle, or less [m]."""
-
-    def distance(self, first: Vec, second: Vec) -> Scalar:
-        """Distance of a segment [m], where nothing but its size counts: it may have no gradient."""
-        return self.separation(first, second)
-
-    def descent(self, first: Vec, second: Vec, hold: Hold) -> Scalar:  # noqa: ARG002
-        """Signed distance of a segment in a form that is easier to descend [m].
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
+        """Signed distance of a segment from the obstacle, or less [m].
 
         Args:
             first: One end [m].
             second: Other end [m].
             hold: Returns a value as a constant for differentiation.
         """
-        return self.separation(first, second)
+
+    def descent(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
+        """Signed distance of a segment in a form that is easier to descend [m]."""
+        return self.separation(first, second, hold)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Distance of a segment [m], where nothing but its size counts: it may have no gradient."""
+        return self.separation(first, second, lambda value: value)
 
     @abstractmethod
     def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
@@ -67,44 +69,75 @@ class SymbolicSolid(ABC):
 
 
 @dataclass(frozen=True)
-class BoxForm(SymbolicSolid):
-    """A box along the axes of a frame; the frame is the world's where it has no rotation.
+class UprightForm(SymbolicSolid):
+    """A box along the world's axes, by ranges: all is exact, for cuboids that are upright.
 
     Attributes:
-        bounds: Its bounds in the frame [m].
+        bounds: Its bounds [m].
+    """
+
+    bounds: Bounds
+
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:  # noqa: ARG002
+        """Return the signed distance."""
+        return segment_box_separation(first, second, self.bounds)
+
+    def descent(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
+        """Return the distance or, inside, the depth of the middle of what is inside."""
+        return signed_segment_box_distance(first, second, self.bounds, hold=hold)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Return the distance, 0 where they touch."""
+        return segment_box_distance(first, second, self.bounds)
+
+    def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Try the normals of the faces."""
+        return upright_box_separation(centre, rotation, size, self.bounds)
+
+
+@dataclass(frozen=True)
+class BoxForm(SymbolicSolid):
+    """A box along the axes of a frame, which are the world's where it has no rotation.
+
+    Attributes:
+        centre: Its centre in the frame [m].
+        half: Half its edge lengths [m].
         origin: Origin of the frame [m].
         rotation: Rows of the frame's rotation matrix, or None.
     """
 
-    bounds: Bounds
+    centre: Vec
+    half: Vec
     origin: Vec
-    rotation: list[Vec] | None = None
+    rotation: list[Vec] | None
+
+    @property
+    def bounds(self) -> Bounds:
+        """Its bounds in the frame [m]."""
+        return [(x - half, x + half) for x, half in zip(self.centre, self.half, strict=True)]
 
     def within(self, point: Vec) -> Vec:
-        """Return a point in the box's frame."""
-        return point if self.rotation is None else _transposed_times(self.rotation, subtract(point, self.origin))
+        """Return a point in the frame."""
+        from_origin = subtract(point, self.origin)
+        return from_origin if self.rotation is None else _transposed_times(self.rotation, from_origin)
 
-    def separation(self, first: Vec, second: Vec) -> Scalar:
-        """Return the exact signed distance."""
-        return segment_box_separation(self.within(first), self.within(second), self.bounds)
+    def axes_within(self, rotation: list[Vec]) -> list[Vec]:
+        """Return the columns of a rotation matrix in the frame."""
+        columns = [[row[i] for row in rotation] for i in range(3)]
+        return columns if self.rotation is None else [_transposed_times(self.rotation, each) for each in columns]
+
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
+        """Return the distance or, inside, the depth of the middle of what is inside."""
+        return signed_segment_box_distance(self.within(first), self.within(second), self.bounds, hold=hold)
 
     def distance(self, first: Vec, second: Vec) -> Scalar:
         """Return the distance, 0 where they touch."""
         return segment_box_distance(self.within(first), self.within(second), self.bounds)
 
-    def descent(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
-        """Return the distance or, inside, the depth of the middle of what is inside."""
-        return signed_segment_box_distance(self.within(first), self.within(second), self.bounds, hold=hold)
-
     def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
-        """Try the normals of faces, and of pairs of edges where the box is turned."""
-        if self.rotation is None:
-            return upright_box_separation(centre, rotation, size, self.bounds)
-        turned = [_transposed_times(self.rotation, column) for column in _columns(rotation)]
-        place = self.within(centre)
-        middle = [(low + high) / 2 for low, high in self.bounds]
-        half = [(high - low) / 2 for low, high in self.bounds]
-        return _cuboids_apart(subtract(place, middle), turned, [edge / 2 for edge in size], half)
+        """Try all 15 axes that can separate two cuboids."""
+        place = subtract(self.within(centre), self.centre)
+        return _cuboids_apart(place, self.axes_within(rotation), [edge / 2 for edge in size], self.half)
 
 
 @dataclass(frozen=True)
@@ -117,36 +150,34 @@ class HullForm(BoxForm):
 
     planes: Sequence[Sequence[float]] = ()
 
-    def separation(self, first: Vec, second: Vec) -> Scalar:
-        """Take the larger one of the distance from the box and the separations along the planes' normals."""
-        return self._beyond(super().separation(first, second), first, second)
-
-    def distance(self, first: Vec, second: Vec) -> Scalar:
-        """Likewise."""
-        return self.separation(first, second)
-
-    def descent(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
-        """Likewise."""
-        return self._beyond(super().descent(first, second, hold), first, second)
-
-    def _beyond(self, best: Scalar, first: Vec, second: Vec) -> Scalar:
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
+        """Take the larger one of the distance from the box and the best separation along a plane's normal."""
         import casadi as ca
 
         a, b = self.within(first), self.within(second)
+        best: Scalar = -ENDLESS
+        plane = [0.0] * 4
         for *normal, offset in self.planes:
-            best = ca.fmax(best, ca.fmin(dot(normal, a), dot(normal, b)) - offset)
-        return best
+            beyond = ca.fmin(dot(normal, a), dot(normal, b)) - offset
+            better = beyond > best
+            best = ca.fmax(best, beyond)
+            plane = [ca.if_else(better, new, old) for new, old in zip((*normal, offset), plane, strict=True)]
+        *normal, offset = plane  # constants for differentiation
+        beyond = ca.fmin(dot(normal, a), dot(normal, b)) - offset if self.planes else best
+        return ca.fmax(super().separation(first, second, hold), beyond)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Likewise."""
+        return self.separation(first, second, lambda value: value)
 
     def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Likewise."""
         import casadi as ca
 
         best = super().cuboid_separation(centre, rotation, size)
-        place = self.within(centre)
-        columns = _columns(rotation)
-        edges = columns if self.rotation is None else [_transposed_times(self.rotation, each) for each in columns]
+        place, axes = self.within(centre), self.axes_within(rotation)
         for *normal, offset in self.planes:
-            reach = sum(edge / 2 * ca.fabs(dot(normal, axis)) for edge, axis in zip(size, edges, strict=True))
+            reach = sum(edge / 2 * ca.fabs(dot(normal, axis)) for edge, axis in zip(size, axes, strict=True))
             best = ca.fmax(best, dot(normal, place) - reach - offset)
         return best
 
@@ -165,7 +196,7 @@ class RoundForm(SymbolicSolid):
     second: Vec
     radius: Scalar
 
-    def separation(self, first: Vec, second: Vec) -> Scalar:
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:  # noqa: ARG002
         """Return the exact signed distance, or minus the radius where the segments cross."""
         return segment_distance((first, second), (self.first, self.second)) - self.radius
 
@@ -189,10 +220,11 @@ class CylinderForm(SymbolicSolid):
     half: Vec
     radius: Scalar
 
-    def separation(self, first: Vec, second: Vec) -> Scalar:
-        """Halve the segment, each time towards its nearest point; what is left of it is taken off the distance.
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
+        """Halve the segment some times, each time towards its nearest point.
 
-        The distance is convex along the segment. It has no derivative with respect to where on it the point is.
+        The distance is convex along the segment: it is nowhere less than where the halving ends, less what is left of
+        the segment times the slope there. The nearest point may be held while the distance is differentiated.
         """
         import casadi as ca
 
@@ -203,24 +235,27 @@ class CylinderForm(SymbolicSolid):
         off, drift = subtract(from_centre, scale(axis, high)), subtract(along, scale(axis, climb))
         square, growth, bend = dot(off, off), dot(off, drift), dot(drift, drift)
 
-        def gaps(t: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-            z = high + t * climb
+        def gaps(t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+            """How far from the axis a point is, and how far beyond the side and the ends [m]."""
             away = ca.sqrt(ca.fmax(square + t * (2 * growth + t * bend), 0) + POINT)
-            return z, away, away - self.radius, ca.fabs(z) - extent
+            return away, away - self.radius, ca.fabs(high + t * climb) - extent
 
-        low, width = ca.SX(0), 1.0
-        for _ in range(HALVINGS):
-            width /= 2
-            t = low + width
-            z, away, beside, beyond = gaps(t)
+        def slope(t: Scalar) -> Scalar:
+            away, beside, beyond = gaps(t)
             outside = ca.fmax(beside, beyond) > 0
             by_side = ca.if_else(outside, ca.fmax(beside, 0), beside >= beyond)
             by_end = ca.if_else(outside, ca.fmax(beyond, 0), beside < beyond)
-            slope = by_side * (growth + t * bend) + by_end * ca.sign(z) * climb * away
-            low = low + width * (slope < 0)
-        _, _, beside, beyond = gaps(low + width / 2)
+            steep = by_side * (growth + t * bend) / away + by_end * ca.sign(high + t * climb) * climb
+            return steep / ca.sqrt(by_side * by_side + by_end * by_end + POINT)
+
+        t, width = ca.SX(0.5), 0.5
+        for _ in range(HALVINGS):
+            width /= 2
+            t = t + ca.if_else(slope(t) < 0, width, -width)
+        t, off_by = hold(t), hold(width * ca.fabs(slope(t)))
+        _, beside, beyond = gaps(t)
         apart = ca.sqrt(ca.fmax(beside, 0) ** 2 + ca.fmax(beyond, 0) ** 2 + POINT)
-        return apart + ca.fmin(ca.fmax(beside, beyond), 0) - width / 2 * ca.sqrt(dot(along, along))
+        return apart + ca.fmin(ca.fmax(beside, beyond), 0) - off_by
 
     def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Try the cylinder's axis, the directions from it, and the normals of the cuboid's faces."""
@@ -253,9 +288,7 @@ def _solid(obstacle: "Obstacle", numbers: Vec) -> SymbolicSolid:
 
 
 def _box(obstacle: "Obstacle", position: Vec, rest: Vec) -> BoxForm:
-    if obstacle.is_turned:
-        return BoxForm([(-half, half) for half in rest[:3]], position, _three_rows(rest[3:]))
-    return BoxForm([(x - half, x + half) for x, half in zip(position, rest, strict=True)], position)
+    return BoxForm([0.0] * 3, rest[:3], position, _three_rows(rest[3:]) if obstacle.is_turned else None)
 
 
 def _sphere(_: "Obstacle", position: Vec, rest: Vec) -> RoundForm:
@@ -272,8 +305,9 @@ def _cylinder(_: "Obstacle", position: Vec, rest: Vec) -> CylinderForm:
 
 def _mesh(obstacle: "Obstacle", position: Vec, rest: Vec) -> HullForm:
     corners = corners_of(obstacle.mesh)
-    bounds: Bounds = list(zip(corners.min(axis=0).tolist(), corners.max(axis=0).tolist(), strict=True))
-    return HullForm(bounds, position, _three_rows(rest), supporting_planes(corners).tolist())
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    centre, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
+    return HullForm(centre, half, position, _three_rows(rest), supporting_planes(corners).tolist())
 
 
 _MADE: dict[str, Callable[["Obstacle", Vec, Vec], SymbolicSolid]] = {
@@ -285,10 +319,10 @@ _MADE: dict[str, Callable[["Obstacle", Vec, Vec], SymbolicSolid]] = {
 }
 
 
-def _upright(obstacle: "Obstacle", top: Scalar) -> BoxForm:
+def _upright(obstacle: "Obstacle", top: Scalar) -> UprightForm:
     height, spans = obstacle.height, [each for each in (obstacle.x, obstacle.y) if each is not None]
     sides: Bounds = [(span.low, span.high) for span in spans]
-    return BoxForm([*sides, (None if height is None else top - height, top)], [])
+    return UprightForm([*sides, (None if height is None else top - height, top)])
 
 
 def _cuboids_apart(place: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:
@@ -303,22 +337,18 @@ def _cuboids_apart(place: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar
     import casadi as ca
 
     units = [[float(i == j) for j in range(3)] for i in range(3)]
-    best: Scalar = -1e3
+    best: Scalar = -ENDLESS
     for normal in [*units, *axes, *(cross(unit, axis) for unit in units for axis in axes)]:
         square = dot(normal, normal)
         reach = sum(edge * ca.fabs(dot(normal, axis)) for edge, axis in zip(half, axes, strict=True))
         reach = reach + sum(edge * ca.fabs(x) for edge, x in zip(other, normal, strict=True))
         apart = (ca.fabs(dot(normal, place)) - reach) / ca.sqrt(ca.fmax(square, PARALLEL))
-        best = ca.fmax(best, ca.if_else(square > PARALLEL, apart, -1e3))
+        best = ca.fmax(best, ca.if_else(square > PARALLEL, apart, -ENDLESS))
     return best
 
 
 def _three_rows(numbers: Vec) -> list[Vec]:
     return [numbers[0:3], numbers[3:6], numbers[6:9]]
-
-
-def _columns(rotation: list[Vec]) -> list[Vec]:
-    return [[row[i] for row in rotation] for i in range(3)]
 
 
 def _transposed_times(matrix: list[Vec], vector: Vec) -> Vec:

@@ -5,7 +5,7 @@ nothing.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -267,6 +267,33 @@ class SymbolicState:
     def hold(self, value: Scalar) -> Scalar:
         """Return a value that the derivative of what it is used in may take as a constant; here nothing is held."""
         return value
+
+
+@dataclass(frozen=True)
+class HeldState(SymbolicState):
+    """A state whose held values are symbols until the derivatives are built.
+
+    Attributes:
+        held: Pairs of a symbol and the value that it stands for.
+    """
+
+    held: list[tuple[Any, Any]] = field(default_factory=list)
+
+    def hold(self, value: Scalar) -> Scalar:
+        """Return a symbol for a value, so that derivatives pass it by."""
+        import casadi as ca
+
+        symbol = ca.SX.sym(f"held_{len(self.held)}")
+        self.held.append((symbol, value))
+        return symbol
+
+    def released(self, results: list[Any]) -> list[Any]:
+        """Put held values back in the place of their symbols."""
+        import casadi as ca
+
+        symbols, values = [symbol for symbol, _ in self.held], [value for _, value in self.held]
+        found: list[Any] = ca.substitute(results, symbols, values) if symbols else results
+        return found
 
 
 def jerk_along(path: Sequence[Vec], rate: Sequence[Scalar]) -> Vec | None:

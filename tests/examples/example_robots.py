@@ -1,4 +1,4 @@
-"""Where the robots of the package example-robot-data are, if it is installed; and a Panda between two shelves."""
+"""Where the robots of the package example-robot-data are, if it is installed; and a Panda among obstacles."""
 
 from collections.abc import Iterable
 from importlib import metadata
@@ -38,25 +38,7 @@ base = "[0, -40, 0, -126, 0, 92, 45] deg"
 {robot}
 [limits]
 acceleration_cap = "10 rad/s^2"
-[[obstacle]]
-name = "table"
-x = "[0.3, 0.9] m"
-y = "[-0.5, 0.5] m"
-top = "0.1 m"
-height = "0.1 m"
-[[obstacle]]
-name = "shelf"
-x = "[0.4, 0.9] m"
-y = "[-0.5, 0.5] m"
-top = "0.75 m"
-height = "0.03 m"
-[[obstacle]]
-name = "post"
-x = "[0.5, 0.6] m"
-y = "[-0.05, 0.05] m"
-top = "0.4 m"
-height = "0.3 m"
-[[constraint]]
+{obstacles}[[constraint]]
 use = "joint-position"
 tolerance = "1e-3 rad"
 [[constraint]]
@@ -75,6 +57,84 @@ tolerance = "0 mm"
 use = "self-clearance"
 tolerance = "0 mm"
 """
+SHELVES = """
+[[obstacle]]
+name = "table"
+x = "[0.3, 0.9] m"
+y = "[-0.5, 0.5] m"
+top = "0.1 m"
+height = "0.1 m"
+[[obstacle]]
+name = "shelf"
+x = "[0.4, 0.9] m"
+y = "[-0.5, 0.5] m"
+top = "0.75 m"
+height = "0.03 m"
+[[obstacle]]
+name = "post"
+x = "[0.5, 0.6] m"
+y = "[-0.05, 0.05] m"
+top = "0.4 m"
+height = "0.3 m"
+"""
+CLUTTER = """
+[[obstacle]]
+name = "table"
+position = [0.6, 0.0, 0.05]
+size = [0.6, 1.2, 0.1]
+[[obstacle]]
+name = "shelf"
+position = [0.65, 0.35, 0.5]
+size = [0.4, 0.4, 0.02]
+[[obstacle]]
+name = "shelf-side"
+position = [0.6, 0.12, 0.3]
+size = [0.3, 0.02, 0.4]
+rotation = "[0, 0, 10] deg"
+[[obstacle]]
+name = "cage-1"
+kind = "cylinder"
+position = [0.3, 0.6, 0.6]
+radius = "2 cm"
+length = 1.2
+[[obstacle]]
+name = "cage-2"
+kind = "cylinder"
+position = [0.3, -0.6, 0.6]
+radius = "2 cm"
+length = 1.2
+[[obstacle]]
+name = "cage-3"
+kind = "cylinder"
+position = [-0.35, 0.35, 0.6]
+radius = "2 cm"
+length = 1.2
+[[obstacle]]
+name = "cage-4"
+kind = "cylinder"
+position = [-0.35, -0.35, 0.6]
+radius = "2 cm"
+length = 1.2
+[[obstacle]]
+name = "pipe-across"
+kind = "capsule"
+position = [0.45, 0.0, 0.9]
+rotation = "[90, 0, 0] deg"
+radius = "3 cm"
+length = 1.2
+[[obstacle]]
+name = "pipe-slanting"
+kind = "capsule"
+position = [0.75, -0.3, 0.4]
+rotation = "[30, 0, 0] deg"
+radius = "3 cm"
+length = 0.6
+[[obstacle]]
+name = "lamp"
+kind = "sphere"
+position = [0.5, -0.1, 0.65]
+radius = "8 cm"
+"""
 START = '["[0.4, 0.7] m", "[-0.4, -0.1] m", "[0.2, 0.6] m"]'
 GOAL = '["[0.4, 0.7] m", "[0.1, 0.4] m", "[0.2, 0.6] m"]'
 GUESS = """[
@@ -82,9 +142,9 @@ GUESS = """[
 ]"""
 
 
-def write_panda(where: Path, robot: str = "") -> Path:
+def write_panda(where: Path, robot: str = "", obstacles: str = SHELVES) -> Path:
     """Write the problem and its pipeline; return the problem file."""
     joints = ", ".join(f'"panda_joint{number}"' for number in range(1, 8))
-    (where / "problem.toml").write_text(PANDA.format(share=folder(), joints=joints, robot=robot))
+    (where / "problem.toml").write_text(PANDA.format(share=folder(), joints=joints, robot=robot, obstacles=obstacles))
     write_pipeline(where, name="panda-shelves", start=START, goal=GOAL, guess=GUESS)
     return where / "problem.toml"

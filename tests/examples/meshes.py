@@ -3,18 +3,19 @@
 import re
 from pathlib import Path
 
-import coal
 import numpy as np
 import pinocchio as pin
 from scipy.interpolate import BSpline
 
 from cnpgen.plans import Plans
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from tests.examples.obstacles import coal_obstacle
 
 
 class Meshes:
-    """A robot as Pinocchio reads it from its file, among the problem's boxes, whose tops stand still.
+    """A robot as Pinocchio reads it from its file, among the problem's obstacles, all fixed.
 
     Args:
         problem: The problem, just read from its file.
@@ -30,8 +31,8 @@ class Meshes:
         locked = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
         self.model, (self.geometry,) = pin.buildReducedModel(full, [geometry], locked, pin.neutral(full))
         links = list(self.geometry.geometryObjects)
-        for box in problem.obstacle:
-            self._add_box(box, [i for i, each in enumerate(links) if each.parentJoint > 0])
+        for obstacle in problem.obstacle:
+            self._add(obstacle, [i for i, each in enumerate(links) if each.parentJoint > 0])
         self.with_obstacles = len(self.geometry.collisionPairs)
         names = [self.model.frames[each.parentFrame].name for each in links]
         left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
@@ -43,10 +44,10 @@ class Meshes:
         for request in self.results.distanceRequests:
             request.gjk_tolerance = 1e-9
 
-    def _add_box(self, box, moving: list[int]) -> None:
-        middle = np.array([(box.x.low + box.x.high) / 2, (box.y.low + box.y.high) / 2, box.top - box.height / 2])
-        solid = coal.Box(box.x.high - box.x.low, box.y.high - box.y.low, box.height)
-        index = self.geometry.addGeometryObject(pin.GeometryObject(box.name, 0, pin.SE3(np.eye(3), middle), solid))
+    def _add(self, obstacle: Obstacle, moving: list[int]) -> None:
+        solid, place = coal_obstacle(obstacle)
+        pose = pin.SE3(place.getRotation(), place.getTranslation())
+        index = self.geometry.addGeometryObject(pin.GeometryObject(obstacle.name, 0, pose, solid))
         for each in moving:
             self.geometry.addCollisionPair(pin.CollisionPair(each, index))
 

@@ -62,6 +62,38 @@ y = [-0.3, 0.3]
 top = 0.9
 height = 0.05
 """
+KINDS = """
+[[obstacle]]
+name = "wall"
+position = [0.5, 0.0, 0.15]
+size = [0.1, 0.5, 0.3]
+rotation = "[0, 0, 20] deg"
+[[obstacle]]
+name = "ball"
+kind = "sphere"
+position = [0.3, 0.35, 0.55]
+radius = 0.08
+[[obstacle]]
+name = "post"
+kind = "cylinder"
+position = [0.55, -0.25, 0.3]
+radius = 0.05
+length = 0.6
+[[obstacle]]
+name = "pipe"
+kind = "capsule"
+position = [0.0, 0.0, 0.95]
+radius = 0.04
+length = 1.0
+rotation = "[90, 0, 0] deg"
+[[obstacle]]
+name = "wedge"
+kind = "mesh"
+mesh = "crane/meshes/wedge.stl"
+scale = [0.001, 0.001, 0.001]
+position = [0.2, 0.55, 0.1]
+rotation = "[0, -60, 30] deg"
+"""
 SELF = '[[constraint]]\nuse = "self-clearance"\ntolerance = 1e-4\n'
 _PIPELINE = """
 name = "{name}"

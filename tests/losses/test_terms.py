@@ -11,12 +11,11 @@ import pytest
 
 from cnpgen.kernels.interpreted import InterpretedGridKernel
 from cnpgen.kernels.tape import GridSpec, tape_from_function
-from cnpgen.losses.integrand import HeldState
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import constraint_term
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.symbolic.boxes import signed_segment_box_distance
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.state import HeldState, SymbolicState, symbols
 from tests.examples.losses import huber
 from tests.examples.plans import PROBLEMS, ROBOTS
 from tests.symbolic.test_state import HIGH, LOW, box_bounds, coal_segment_separation, segments

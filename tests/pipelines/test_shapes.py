@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.judges.rows.verify import verify_rows
+from cnpgen.kernels.tape import tape_from_function
 from cnpgen.pipelines.context import Context, load_context
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
@@ -14,17 +15,24 @@ from cnpgen.pipelines.stages.stage import Round
 from cnpgen.pipelines.undecided import settle, undecided
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.refine.solver.residuals import stage_values
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.state import World
 from tests.conftest import Prepare, run_stages
-from tests.examples.shaped_robot import write_pipeline, write_problem
+from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_problem
 
-TOPS = np.array([0.3, 0.9])
 COLLISION = '[[stage]]\nuse = "collision"\nend = "start"\njudge = "segments"\n'
 
 
-@pytest.fixture(scope="module")
-def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    return load_problem(write_problem(tmp_path_factory.mktemp("crane")))
+@pytest.fixture(scope="module", params=[OBSTACLES, KINDS], ids=["boxes", "kinds"])
+def problem(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Problem:
+    return load_problem(write_problem(tmp_path_factory.mktemp("crane"), obstacles=request.param))
+
+
+def tops_of(context: Context, count: int) -> np.ndarray:
+    """The numbers of the obstacles, shape (numbers, count)."""
+    return np.repeat(place_obstacles(context.problem.obstacle)[:, None], count, axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -43,14 +51,14 @@ def measured(context: Context, drawn: np.ndarray) -> np.ndarray:
     """The smallest distances of every state [m]: from obstacles, between links."""
     world, zero, found = World(context.robot, context.problem.obstacle), np.zeros(context.robot.n), []
     for q in drawn.T:
-        world.set_state(q.copy(), zero, zero, TOPS)
+        world.set_state(q.copy(), zero, zero, place_obstacles(context.problem.obstacle))
         found.append((min(world.shape_distances()), min(world.self_distances())))
     return np.array(found).T
 
 
 def test_ends_are_decided_by_the_pieces_and_only_where_capsules_are_not_clear(context, drawn, monkeypatch):
     decide, asked = settle(context, "start"), []
-    tops, still = np.repeat(TOPS[:, None], drawn.shape[1], axis=1), np.zeros_like(drawn)
+    tops, still = tops_of(context, drawn.shape[1]), np.zeros_like(drawn)
     real = World.set_state
     monkeypatch.setattr(World, "set_state", lambda *x: (asked.append(x[1]), real(*x))[1])
     broken = decide((drawn, still, still), tops, np.ones(drawn.shape[1], bool))
@@ -67,7 +75,7 @@ def test_ends_are_decided_by_the_pieces_and_only_where_capsules_are_not_clear(co
 
 
 def test_what_nobody_asks_for_is_not_decided(context, drawn):
-    tops, still = np.repeat(TOPS[:, None], drawn.shape[1], axis=1), np.zeros_like(drawn)
+    tops, still = tops_of(context, drawn.shape[1]), np.zeros_like(drawn)
     assert not settle(context, "goal")((drawn, still, still), tops, np.zeros(drawn.shape[1], bool)).any()
 
 
@@ -87,16 +95,32 @@ def test_the_collision_stage_keeps_what_the_pieces_do_not_forbid(context, drawn)
 
 
 def test_the_capsules_clearance_is_a_lower_bound(context, drawn):
-    tops = np.repeat(TOPS[:, None], drawn.shape[1], axis=1)
+    tops = tops_of(context, drawn.shape[1])
     (clearance,) = context.kernels.load(capsule_clearance)(drawn, tops)
     distance = measured(context, drawn)[0]
     assert (clearance[0] <= np.maximum(distance, 0) + 1e-9).all()
     assert (clearance[0] > 0).mean() > 0.2
 
 
+def test_scenes_of_the_same_kinds_need_no_other_kernels(tmp_path: Path):
+    """Where obstacles are and how large is none of the kernels' business."""
+    found = []
+    for number, words in enumerate([("0.08", "0.6", "20"), ("0.12", "0.5", "50")]):
+        text = KINDS
+        for old, new in zip(("0.08", "0.6", "20"), words, strict=True):
+            text = text.replace(old, new)
+        problem = load_problem(write_problem(tmp_path / str(number), obstacles=text))
+        robot = load_robot(problem)
+        found.append(
+            [tape_from_function(build(robot, problem)).to_bytes() for build in (capsule_clearance, stage_values)]
+        )
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("collision", ["", COLLISION])
-def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, prepare: Prepare, collision):
-    write_problem(tmp_path)
+@pytest.mark.parametrize("obstacles", [OBSTACLES, KINDS], ids=["boxes", "kinds"])
+def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, prepare: Prepare, collision, obstacles):
+    write_problem(tmp_path, obstacles=obstacles)
     pipeline = load_pipeline(write_pipeline(tmp_path, collision=collision))
     prepared: PreparedPipeline = prepare(pipeline, "numpy")
     block = prepared.block(3, "train", 0, stop=300)

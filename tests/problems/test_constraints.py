@@ -27,6 +27,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import count_numbers
 from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
@@ -80,7 +81,7 @@ class Bench:
         self.world = World(self.robot, problem.obstacle, problem.object_size)
 
     def state(self, q: Any, dq: Any = 0.0, ddq: Any = 0.0, tops: Any = -5.0) -> World:
-        n, m = self.robot.n, len(self.problem.obstacle)
+        n, m = self.robot.n, count_numbers(self.problem.obstacle)
         self.world.set_state(
             *(np.broadcast_to(x, n).astype(float) for x in (q, dq, ddq)), np.broadcast_to(tops, m) * 1.0
         )

@@ -13,9 +13,10 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load import load_problem
 from cnpgen.robots.shape.pairs import segment_distances
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.symbolic.segments import segment_distance
 from cnpgen.symbolic.state import SymbolicState, symbols
-from tests.examples.shaped_robot import write_problem
+from tests.examples.shaped_robot import KINDS, write_problem
 from tests.problems.test_constraint_derivatives import differences
 from tests.problems.test_constraints import Bench
 
@@ -28,10 +29,10 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     return Bench(load_problem(write_problem(tmp_path_factory.mktemp("crane"))))
 
 
-def symbolic(bench: Bench, constraint: Constraint, form: str) -> tuple[ca.Function, Condition]:
+def symbolic(bench: Bench, constraint: Constraint, form: str, tops: np.ndarray = TOPS) -> tuple[ca.Function, Condition]:
     """How much larger the smallest distance of a form is than it must be, as a function of q; the form's condition."""
     (q_sx, q), zero = symbols("q", bench.robot.n), [0.0] * bench.robot.n
-    state = SymbolicState(bench.robot, q, zero, zero, TOPS.tolist(), bench.problem.obstacle, None)
+    state = SymbolicState(bench.robot, q, zero, zero, tops.tolist(), bench.problem.obstacle, None)
     found = constraint.symbolic_at(state, "goal") if form == "symbolic_at" else getattr(constraint, form)(state)
     (condition,) = found
     return ca.Function("room", [q_sx], [ca.mmin(ca.vertcat(*condition.g) - condition.lower)]), condition
@@ -60,6 +61,22 @@ def test_what_capsules_clear_is_clear(bench, name, form):
             clear += 1
             assert room(bench, CLEARANCES[name], q) > -1e-9
     assert clear > 50 or (name == "itself" and form != "symbolic_at")
+
+
+@pytest.mark.parametrize("form", ["symbolic", "penalised"])
+def test_what_capsules_clear_of_obstacles_of_every_kind_is_clear(tmp_path, form):
+    bench = Bench(load_problem(write_problem(tmp_path, obstacles=KINDS)))
+    constraint, tops = CLEARANCES["obstacles"], place_obstacles(bench.problem.obstacle)
+    function, condition = symbolic(bench, constraint, form, tops)
+    assert condition.sufficient
+    assert len(constraint.solved(bench.world)[0].g) == len(condition.g)
+    clear = 0
+    for q in states(bench, 300, seed=1):
+        if float(function(q)) >= 0:
+            clear += 1
+            (measured,) = constraint.measured(bench.state(q, tops=tops))
+            assert min(measured.g) >= constraint.distance
+    assert clear > 30
 
 
 @pytest.mark.parametrize("name", CLEARANCES)

@@ -38,7 +38,7 @@ class RobotClearance(Constraint):
         from cnpgen.symbolic.solids import symbolic_solids
 
         (segments, radii), solids = self._capsules(state), symbolic_solids(state)
-        distances = [solid.separation(a, b) for a, b in segments for solid in solids]
+        distances = [solid.separation(a, b, state.hold) for a, b in segments for solid in solids]
         return self._clear(distances, radii, sufficient=_is_cautious(state))
 
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import SymbolicState, jerk_along, symbols
+from cnpgen.symbolic.state import HeldState, jerk_along, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -25,22 +25,22 @@ def stage_values(robot: "Robot", problem: Problem) -> Any:
     """
     import casadi as ca
 
-    w_sx, tops_sx, g = _stage(robot, problem)
-    return ca.Function("stage_values", [w_sx, tops_sx], [ca.vertcat(*g)])
+    columns, state, g = _stage(robot, problem)
+    return ca.Function("stage_values", columns, state.released([ca.vertcat(*g)]))
 
 
 def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
     """Build ``(w, tops) -> (g, dg/dw)``, the Jacobian column by column."""
     import casadi as ca
 
-    w_sx, tops_sx, g = _stage(robot, problem)
+    columns, state, g = _stage(robot, problem)
     residuals = ca.vertcat(*g)
-    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
-    outputs = ca.cse([residuals, ca.vec(jacobian)])
-    return ca.Function("stage_jacobian", [w_sx, tops_sx], outputs)
+    jacobian = ca.densify(ca.jacobian(residuals, columns[0]))
+    outputs = ca.cse(state.released([residuals, ca.vec(jacobian)]))
+    return ca.Function("stage_jacobian", columns, outputs)
 
 
-def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
+def _stage(robot: "Robot", problem: Problem) -> tuple[list[Any], HeldState, list[Any]]:
     n, orders = robot.n, problem.path_orders
     (w_sx, w), (tops_sx, tops) = symbols("w", orders * n + orders - 1), symbols("tops", count_numbers(problem.obstacle))
     p, *path = (w[order * n : (order + 1) * n] for order in range(orders))
@@ -49,13 +49,13 @@ def _stage(robot: "Robot", problem: Problem) -> tuple[Any, Any, list[Any]]:
     dq = [a * r for a in p1]
     ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
     jerk = jerk_along(path, rate)
-    state = SymbolicState(robot, p, dq, ddq, tops, problem.obstacle, problem.object_size, jerk)
+    state = HeldState(robot, p, dq, ddq, tops, problem.obstacle, problem.object_size, jerk)
     g = []
     for constraint in problem.constraint:
         for condition in constraint.symbolic(state):
             scales = residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.exactness)
             g += [value / float(scale) for value, scale in zip(condition.g, scales, strict=True)]
-    return w_sx, tops_sx, g
+    return [w_sx, tops_sx], state, g
 
 
 def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> Array:
