@@ -18,6 +18,7 @@ from cnpgen.cli import (
     evaluate_command,
     export_command,
     extend_command,
+    init_command,
     inspect_command,
     list_command,
     make_command,
@@ -41,6 +42,7 @@ _COMMANDS = (
     make_command,
     merge_command,
     extend_command,
+    init_command,
     list_command,
     show_command,
     inspect_command,
@@ -62,6 +64,7 @@ _DESCRIPTION = "Make, inspect and prove datasets of boundary problems for kinody
 _EPILOG = """\
 examples:
   cnpgen list                                        what there is
+  cnpgen init my-arm --urdf arm.urdf                 recipes for an arm of your own
   cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
   cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
   cnpgen validate airhockey-hit-v1 --deep            prove that they are right
