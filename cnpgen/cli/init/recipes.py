@@ -134,7 +134,7 @@ def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
         GoalIK(),
         *holding["goal"],
         AtRest(end="start"),
-        AtRest(end="goal", acceleration="zero"),
+        AtRest(end="goal"),
     )
 
 

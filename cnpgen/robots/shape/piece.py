@@ -61,7 +61,7 @@ def link_pieces(urdf: str) -> list[Piece]:
         for element in link.iter("collision"):
             name = link.get("name", "")
             try:
-                found.append(_piece(name, element))
+                found.append(piece_of(name, element))
             except (ValueError, TypeError) as error:
                 mistakes.append(f"the collision geometry of link {name!r} cannot be read: {error}")
     if mistakes:
@@ -69,11 +69,16 @@ def link_pieces(urdf: str) -> list[Piece]:
     return found
 
 
-def _piece(link: str, element: ElementTree.Element) -> Piece:
+def piece_of(link: str, element: ElementTree.Element) -> Piece:
+    """Read the geometry of an element of a link, with its place there.
+
+    Raises:
+        ValueError: It has none, or numbers that are none; or its mesh is not inline.
+    """
     shape = element.find("geometry/*")
     if shape is None:
         raise ValueError("it has no <geometry>")
-    piece = Piece(link, *_core(shape)).moved(*_origin(element.find("origin")))
+    piece = Piece(link, *_core(shape)).moved(*origin_of(element.find("origin")))
     if not np.isfinite(piece.vertices).all():
         raise ValueError("it has numbers that are not finite")
     return piece
@@ -103,7 +108,7 @@ def _circle(radius: float) -> Iterator[tuple[float, float]]:
         yield outer * math.cos(angle), outer * math.sin(angle)
 
 
-def _origin(element: ElementTree.Element | None) -> tuple[Array, Array]:
+def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
     """Return rotation and translation [m] of a geometry in its link: roll, pitch and yaw about fixed axes."""
     if element is None:
         return np.eye(3), np.zeros(3)
