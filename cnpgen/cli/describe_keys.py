@@ -19,7 +19,9 @@ from cnpgen.schema.toml import Kind
 FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe, "suite": Suite}
 """What the files of a kind are read as."""
 
-_GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS}
+GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS}
+"""Tables whose key ``use`` says of which kind they are -> where the kinds are registered."""
+
 _INTRODUCTION = """\
 # Keys of recipe files
 
@@ -83,31 +85,32 @@ def _sections(cls: type, path: str) -> Iterator[str]:
     """Describe the keys of a table, and then those of every table in it that is written in the same file."""
     yield _markdown_table(cls)
     for key in keys(cls):
-        part = _part(key)
+        part = part_of(key)
         name = f"{path}.{key.name}" if path else key.name
-        if part in _GROUPS:
+        if part in GROUPS:
             yield f"### `[[{name}]]`"
             yield "The key `use` of each says of which kind it is; the other keys are those of the kind."
-            for use in registry.names(_GROUPS[part]):
-                kind = registry.load(_GROUPS[part], use)
+            for use in registry.names(GROUPS[part]):
+                kind = registry.load(GROUPS[part], use)
                 yield f"#### `{use}`"
                 yield _first_line(kind)
                 yield _markdown_table(kind) if keys(kind) else "It has no keys."
         elif part is not None:
-            yield f"### `[[{name}]]`" if _is_array(key) else f"### `[{name}]`"
+            yield f"### `[[{name}]]`" if is_array(key) else f"### `[{name}]`"
             yield _first_line(part)
             yield from _sections(part, name)
 
 
-def _part(key: Key) -> type | None:
+def part_of(key: Key) -> type | None:
     """Return the table, or one of the tables, that a key holds in the same file; None where it holds a value."""
-    found: type = get_args(key.hint)[0] if _is_array(key) else key.hint
-    if found in _GROUPS:
+    found: type = get_args(key.hint)[0] if is_array(key) else key.hint
+    if found in GROUPS:
         return found
     return found if dataclasses.is_dataclass(found) and keys(found) and found not in FILES.values() else None
 
 
-def _is_array(key: Key) -> bool:
+def is_array(key: Key) -> bool:
+    """Whether a key holds tables, one after the other."""
     args = get_args(key.hint)
     return bool(args) and dataclasses.is_dataclass(args[0]) and args[0] is not Range
 
@@ -128,7 +131,7 @@ def _escaped(text: str) -> str:
 def _default(key: Key) -> str:
     if key.required:
         return "required"
-    return "those of its keys" if _part(key) and key.default else quantity(key.default, key.unit)
+    return "those of its keys" if part_of(key) and key.default else quantity(key.default, key.unit)
 
 
 def _expected(key: Key) -> str:
@@ -148,11 +151,11 @@ def _table_to_dict(cls: type) -> dict[str, Any]:
 
 def _key_to_dict(key: Key) -> dict[str, Any]:
     """Describe a key, and the table or the tables that it holds."""
-    left_out, part = ("hint", "default", "late"), _part(key)
+    left_out, part = ("hint", "default", "late"), part_of(key)
     content = {spec.name: getattr(key, spec.name) for spec in dataclasses.fields(key) if spec.name not in left_out}
     content |= {"expected": key.expected, "required": key.required}
-    if part in _GROUPS:
-        group = _GROUPS[part]
+    if part in GROUPS:
+        group = GROUPS[part]
         return content | {"kinds": [kind_to_dict(group, use) for use in registry.names(group)]}
     if part is not None:
         return content | {"table": _table_to_dict(part)}

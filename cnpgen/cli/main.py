@@ -18,6 +18,7 @@ from cnpgen.cli import (
     evaluate_command,
     export_command,
     extend_command,
+    init_command,
     inspect_command,
     list_command,
     make_command,
@@ -29,6 +30,7 @@ from cnpgen.cli import (
     solve_command,
     train_command,
     validate_command,
+    view_command,
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
@@ -41,6 +43,7 @@ _COMMANDS = (
     make_command,
     merge_command,
     extend_command,
+    init_command,
     list_command,
     show_command,
     inspect_command,
@@ -51,6 +54,7 @@ _COMMANDS = (
     solve_command,
     refine_command,
     evaluate_command,
+    view_command,
     simulate_command,
     benchmark_command,
     export_command,
@@ -62,6 +66,7 @@ _DESCRIPTION = "Make, inspect and prove datasets of boundary problems for kinody
 _EPILOG = """\
 examples:
   cnpgen list                                        what there is
+  cnpgen init my-arm --urdf arm.urdf                 recipes for an arm of your own
   cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
   cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
   cnpgen validate airhockey-hit-v1 --deep            prove that they are right
@@ -71,6 +76,7 @@ examples:
   cnpgen complete airhockey-replan pucks.csv -o problems.h5; what is solved, refined or planned for
   cnpgen refine plans.h5 -o better.h5                polish anyone's plans
   cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
+  cnpgen view plans.h5 --row 3 -o plan.html          look at one in a browser
   cnpgen simulate plans.h5 --video plan.mp4          execute them in MuJoCo
   cnpgen benchmark hits-81 --simulate                compare planners
   cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators

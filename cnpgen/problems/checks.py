@@ -45,18 +45,15 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
         tree = urdf_tree(read_urdf(path))
     except (RecipeError, ValueError):  # whoever loads the robot says so
         return
-    if any(part.tag.startswith(_XACRO) for part in tree.iter()):
-        text = f"{path.name} is to be read by xacro, expected a URDF: run 'xacro {path.name} > robot.urdf'"
+    if text := unread_xacro(tree, path):
         yield (where / "urdf").says(text)
         return
     moving = [joint.get("name", "") for joint in tree.iter("joint") if joint.get("type", "fixed") != "fixed"]
     for name in joints if isinstance(joints, list) else ():
         if isinstance(name, str) and name not in moving:
             yield (where / "joints").says(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
-    frames = [part.get("name", "") for kind in ("link", "joint") for part in tree.iter(kind)]
-    if isinstance(tip, str) and tip not in frames:
-        text = f"{path.name} has no frame {tip!r}{nearest(tip, frames)}"
-        yield (where / "tip").says(f"{text}; its frames: {', '.join(frames)}")
+    if isinstance(tip, str) and (text := missing_frame(tree, path, tip)):
+        yield (where / "tip").says(text)
     for name, low, high in _locked_outside(tree.iter("joint"), joints if isinstance(joints, list) else []):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
         yield (where / "joints").says(text)
@@ -66,6 +63,28 @@ def named_packages(robot: dict[str, Any], folder: Path) -> list[Path]:
     """List the folders that ``packages`` in the table [robot] of a problem in ``folder`` names."""
     named = robot.get("packages", [])
     return [folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
+
+
+def unread_xacro(tree: ElementTree.Element, path: Path) -> str:
+    """Say that a file is to be read by xacro first; nothing where it is a URDF."""
+    if not any(part.tag.startswith(_XACRO) for part in tree.iter()):
+        return ""
+    return f"{path.name} is to be read by xacro, expected a URDF: run 'xacro {path.name} > robot.urdf'"
+
+
+def frames_of(tree: ElementTree.Element) -> list[str]:
+    """List the links and then the joints of a URDF: Pinocchio has a frame for each."""
+    return [part.get("name", "") for kind in ("link", "joint") for part in tree.findall(kind)]
+
+
+def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
+    """Say that a URDF has no frame of a name, and which it has; nothing where it has one."""
+    frames = frames_of(tree)
+    return (
+        ""
+        if name in frames
+        else f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {', '.join(frames)}"
+    )
 
 
 def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -> Iterator[tuple[str, float, float]]:

@@ -65,7 +65,9 @@ class Chain:
 
     @property
     def reach(self) -> float:
-        """Upper bound of the distance of the tip from the first joint's origin [m] (revolute chains)."""
+        """Upper bound of the distance of the tip from the first joint's origin [m]; none where joints slide."""
+        if any(joint.prismatic for joint in self.joints):
+            return np.inf
         lengths = [float(np.linalg.norm(joint.translation)) for joint in self.joints[1:]]
         return sum(lengths) + float(np.linalg.norm(self.tip_translation))
 

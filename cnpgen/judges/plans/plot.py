@@ -62,7 +62,7 @@ def plot_plan(
         raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
     one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
     with np.errstate(all="ignore"):
-        world, s, t = _along(problem, robot, one, index)
+        world, s, t = along(problem, robot, one, index)
     if tops is None:
         tops = obstacle_tops(problem, world.tip_position[:, 0], world.tip_position[:, -1])
     figure = Figure(figsize=(15, 9), layout="constrained", dpi=110)
@@ -80,11 +80,27 @@ def plot_plan(
         raise machine_error("write", Path(path), error) from error
 
 
-def _along(problem: Problem, robot: Robot, motion: Motion, index: int) -> tuple[PathWorld, Array, Array]:
-    """Place the robot at K moments evenly spaced in time; return the world, phases and times [s], shape (K,) each."""
+def along(
+    problem: Problem, robot: Robot, motion: Motion, index: int, *, samples: int = SAMPLES
+) -> tuple[PathWorld, Array, Array]:
+    """Place the robot at K moments of one motion, evenly spaced in time.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        motion: The motion.
+        index: What messages call it.
+        samples: K.
+
+    Returns:
+        The world, phases, and times [s], shape (K,) each.
+
+    Raises:
+        UsageError: It does not run forward, or its numbers are not finite.
+    """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
-    t = np.linspace(0, motion.duration()[0], SAMPLES)
+    t = np.linspace(0, motion.duration()[0], samples)
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
@@ -96,17 +112,22 @@ def _along(problem: Problem, robot: Robot, motion: Motion, index: int) -> tuple[
     return world, s, t
 
 
-def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
-    """Draw q, dq, ddq, torque and, where it is constrained, jerk of every joint as a share of its limits."""
+def shares_of_limits(world: PathWorld) -> dict[str, Array]:
+    """Return q, dq, ddq, torque and, where it is constrained, jerk as shares of their limits, each of shape (n, K)."""
     robot = world.robot
     middle, half = (robot.position_upper + robot.position_lower) / 2, (robot.position_upper - robot.position_lower) / 2
-    shares = {
+    return {
         "position": (world.q - middle[:, None]) / half[:, None],
         "velocity": world.dq / robot.velocity_limit[:, None],
         "acceleration": world.ddq / robot.acceleration_limit[:, None],
         **({} if world.jerk is None else {"jerk": world.jerk / robot.jerk_limit[:, None]}),
         "torque": world.torque / robot.torque_limit[:, None],
     }
+
+
+def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
+    """Draw what ``shares_of_limits`` returns of every joint over time."""
+    robot, shares = world.robot, shares_of_limits(world)
     axes = figure.subplots(len(shares), 1, sharex=True)
     for axis, (name, share) in zip(axes, shares.items(), strict=True):
         for values, joint in zip(share, robot.joint_names, strict=True):

@@ -41,7 +41,7 @@ def with_inline_meshes(urdf: str, path: Path, packages: Sequence[Path] = ()) -> 
     mistakes: list[str] = []
     for mesh in meshes:
         try:
-            address = inline_mesh(find_named_file(mesh.get("filename", ""), path, packages), _scale(mesh))
+            address = inline_mesh(find_named_file(mesh.get("filename", ""), path, packages), scale_of(mesh))
         except RecipeError as error:
             mistakes += error.mistakes
         else:
@@ -102,7 +102,12 @@ def corners_of(address: str) -> Array:
     return corners
 
 
-def _scale(mesh: ElementTree.Element) -> Array:
+def scale_of(mesh: ElementTree.Element) -> Array:
+    """Return the factors of a mesh's x, y and z, shape (3,).
+
+    Raises:
+        RecipeError: They are none.
+    """
     try:
         scale = np.array([float(each) for each in mesh.get("scale", "1 1 1").split()])
     except ValueError:

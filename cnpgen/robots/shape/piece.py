@@ -60,7 +60,7 @@ def link_pieces(urdf: str) -> list[Piece]:
         for element in link.iter("collision"):
             name = link.get("name", "")
             try:
-                found.append(_piece(name, element))
+                found.append(piece_of(name, element))
             except (ValueError, TypeError) as error:
                 mistakes.append(f"the collision geometry of link {name!r} cannot be read: {error}")
     if mistakes:
@@ -68,11 +68,16 @@ def link_pieces(urdf: str) -> list[Piece]:
     return found
 
 
-def _piece(link: str, element: ElementTree.Element) -> Piece:
+def piece_of(link: str, element: ElementTree.Element) -> Piece:
+    """Read the geometry of an element of a link, with its place there.
+
+    Raises:
+        ValueError: It has none, or numbers that are none; or its mesh is not inline.
+    """
     shape = element.find("geometry/*")
     if shape is None:
         raise ValueError("it has no <geometry>")
-    piece = Piece(link, *_core(shape)).moved(*_origin(element.find("origin")))
+    piece = Piece(link, *_core(shape)).moved(*origin_of(element.find("origin")))
     if not np.isfinite(piece.vertices).all():
         raise ValueError("it has numbers that are not finite")
     return piece
@@ -106,7 +111,7 @@ def prism(outer: float, half: float) -> Array:
     return np.array([[x, y, z] for z in (-half, half) for x, y in circle])
 
 
-def _origin(element: ElementTree.Element | None) -> tuple[Array, Array]:
+def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
     """Return rotation and translation [m] of a geometry in its link: roll, pitch and yaw about fixed axes."""
     if element is None:
         return np.eye(3), np.zeros(3)

@@ -1,0 +1,1 @@
+"""``cnpgen init``: recipes for anybody's arm, from its URDF."""

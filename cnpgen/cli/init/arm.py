@@ -1,0 +1,171 @@
+"""What a URDF says of an arm: its frames and links, the joints that move a tip, and limits that are missing."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
+from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
+
+TURN, SLIDE = math.pi, 0.5  # rad and m: ranges to either side, where the URDF has none
+SPEED = 1.0  # rad/s or m/s, where the URDF has none
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint that moves, with the limits of the URDF or what is put in their place.
+
+    Attributes:
+        name: Its name.
+        kind: Its type in the URDF: "revolute", "continuous", "prismatic" or what cannot be planned.
+        lower: Lower limit of its position [rad or m].
+        upper: Upper limit.
+        velocity: Limit of its velocity [rad/s or m/s].
+        effort: Limit of its torque or force [N m or N]; 0 where the URDF has none.
+        missing: Which limits the URDF does not have: "position", "velocity", "torque".
+    """
+
+    name: str
+    kind: str
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+    missing: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm in a URDF.
+
+    Attributes:
+        urdf: The URDF file.
+        tip: The frame that the task is about.
+        planned: The joints between the root and the tip, from the root outwards.
+        locked: Names of all other joints that move: they stay at zero.
+        moved: The links that planned joints move.
+        frames: Names of all links and joints.
+        masses: Link -> its mass [kg]; 0 where it has none.
+        shaped: The links that have a ``<collision>`` element.
+    """
+
+    urdf: Path
+    tip: str
+    planned: tuple[Joint, ...]
+    locked: tuple[str, ...]
+    moved: tuple[str, ...]
+    frames: tuple[str, ...]
+    masses: Mapping[str, float]
+    shaped: tuple[str, ...]
+
+    @property
+    def has_shape(self) -> bool:
+        """Whether links that move have collision geometry."""
+        return bool(set(self.shaped) & set(self.moved))
+
+
+def read_arm(urdf: Path, tip: str | None) -> Arm:
+    """Read an arm.
+
+    Args:
+        urdf: The URDF file.
+        tip: The frame that the task is about: a link, or a joint; by default the only link that carries no other.
+
+    Raises:
+        RecipeError: It cannot be read, is to be read by xacro, or has no joint that moves the tip.
+        UsageError: There is no such frame, or more than one link that could be meant.
+    """
+    try:
+        tree = urdf_tree(read_urdf(urdf))
+    except ValueError as error:
+        raise RecipeError([f"{urdf}: {error}"]) from error
+    if text := unread_xacro(tree, urdf):
+        raise RecipeError([text])
+    links = [link.get("name", "") for link in tree.findall("link")]
+    joints = {_end(joint, "child"): joint for joint in tree.findall("joint") if joint.find("child") is not None}
+    tip = tip if tip is not None else _only_leaf(urdf, links, joints)
+    if text := missing_frame(tree, urdf, tip):
+        raise UsageError(f"--tip: {text}")
+    path = list(_path(urdf, tip, joints))
+    moving = [joint for joint in path if _moves(joint)]
+    if not moving:
+        raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {', '.join(frames_of(tree))}"])
+    planned = tuple(_joint(urdf, joint) for joint in moving)
+    names = {joint.name for joint in planned}
+    return Arm(
+        urdf=urdf,
+        tip=tip,
+        planned=planned,
+        locked=tuple(
+            str(joint.get("name")) for joint in joints.values() if _moves(joint) and joint.get("name") not in names
+        ),
+        moved=tuple(link for link in links if moving[0] in _path(urdf, link, joints)),
+        frames=tuple(frames_of(tree)),
+        masses={
+            link.get("name", ""): _number(urdf, link.find("inertial/mass"), "value") for link in tree.findall("link")
+        },
+        shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
+    )
+
+
+def with_torques(arm: Arm, torques: list[float]) -> Arm:
+    """Return an arm with torques [N m] in the place of those that the URDF does not have."""
+    pairs = zip(arm.planned, torques, strict=True)
+    return replace(arm, planned=tuple(replace(each, effort=each.effort or torque) for each, torque in pairs))
+
+
+def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, ElementTree.Element]) -> str:
+    parents = {_end(joint, "parent") for joint in joints.values()}
+    leaves = [link for link in links if link not in parents]
+    if len(leaves) != 1:
+        found = f"{len(leaves)} links carry no other: {', '.join(leaves)}" if leaves else "every link carries another"
+        raise UsageError(f"--tip says which frame of {urdf.name} the task is about: {found}")
+    return leaves[0]
+
+
+def _path(urdf: Path, frame: str, joints: Mapping[str, ElementTree.Element]) -> Iterator[ElementTree.Element]:
+    """Return the joints between the root and a frame, from the root outwards."""
+    named = {joint.get("name"): child for child, joint in joints.items()}
+    found, link = list[ElementTree.Element](), frame if frame in joints else named.get(frame, frame)
+    while link in joints:
+        found.append(joints[link])
+        link = _end(joints[link], "parent")
+        if len(found) > len(joints):
+            raise RecipeError([f"{urdf}: its joints go round in a circle at link {link!r}"])
+    return reversed(found)
+
+
+def _end(joint: ElementTree.Element, which: str) -> str:
+    element = joint.find(which)
+    return "" if element is None else element.get("link", "")
+
+
+def _moves(joint: ElementTree.Element) -> bool:
+    return joint.get("type", "fixed") != "fixed"
+
+
+def _joint(urdf: Path, joint: ElementTree.Element) -> Joint:
+    """Read a joint, and fill in what is missing."""
+    limit, kind = joint.find("limit"), joint.get("type", "")
+    lower, upper, velocity, effort = (_number(urdf, limit, key) for key in ("lower", "upper", "velocity", "effort"))
+    missing = {"position": kind == "continuous" or not lower < upper, "velocity": velocity <= 0, "torque": effort <= 0}
+    half = SLIDE if kind == "prismatic" else TURN
+    return Joint(
+        name=joint.get("name", ""),
+        kind=kind,
+        lower=-half if missing["position"] else lower,
+        upper=half if missing["position"] else upper,
+        velocity=SPEED if missing["velocity"] else velocity,
+        effort=max(effort, 0.0),
+        missing=tuple(name for name, is_missing in missing.items() if is_missing),
+    )
+
+
+def _number(urdf: Path, element: ElementTree.Element | None, attribute: str) -> float:
+    try:
+        return number_in(element, attribute, 0.0)
+    except ValueError as error:
+        raise RecipeError([f"{urdf}: {error}"]) from error

@@ -1,0 +1,143 @@
+"""Problem, pipeline and dataset of an arm: from rest to rest between two boxes of positions, within its limits."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cnpgen.cli.init.arm import Arm, Joint, with_torques
+from cnpgen.cli.init.draws import comfortable_base, find_boxes
+from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.draw import DrawPositions
+from cnpgen.pipelines.stages.ik import GoalIK, StartIK
+from cnpgen.pipelines.stages.motion import AtRest
+from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.pipelines.stages.torque import GravityTorque
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.spec import LimitSpec, RobotSpec
+from cnpgen.schema.keys import PerJoint, Range
+
+TURN, SLIDE = 0.5, 0.1  # rad and m: how far guesses of inverse kinematics are from the base configuration
+STATES = 1000  # at which the torques are looked at that are put in the place of missing limits
+
+
+def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) -> tuple[DatasetRecipe, Arm, float]:
+    """Make the recipes of an arm.
+
+    Args:
+        arm: The arm.
+        name: What all three recipes are called.
+        folder: Where they will be written to.
+        packages: Folders in which packages are looked for.
+
+    Returns:
+        The dataset with its pipeline and its problem, the arm with torques in the place of missing ones, and which
+        share of its draws was accepted.
+
+    Raises:
+        RecipeError: The arm cannot be planned for, or no positions were found that it reaches.
+    """
+    places = tuple(str(each.absolute()) for each in packages)
+    provisional = with_torques(arm, [1.0] * len(arm.planned))
+    robot = load_robot(_problem(provisional, name, folder, places))
+    arm = with_torques(arm, _torques(robot))
+    problem = _problem(arm, name, folder, places)
+    if _has_masses(robot):
+        limit = JointTorque(tolerance=5e-3, budget=6e-2)
+        problem = replace(problem, constraint=(*problem.constraint[:3], limit, *problem.constraint[3:]))
+    base = comfortable_base(problem, load_robot(problem))
+    problem = replace(problem, robot=replace(problem.robot, base=base))
+    pipeline = Pipeline(
+        name=name,
+        title=f"From rest to rest: {name}",
+        problem=problem,
+        stage=_stages(arm, problem),
+        path=folder / "pipeline.toml",
+    )
+    pipeline, share = find_boxes(pipeline)
+    splits = {"train": 18_000, "validation": 2_000}
+    dataset = DatasetRecipe(
+        name=name,
+        title=f"Motions from rest to rest: {name}",
+        pipeline=pipeline,
+        splits=splits,
+        path=folder / "dataset.toml",
+    )
+    return dataset, arm, share
+
+
+def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Problem:
+    """Return the problem, its base configuration in the middle of all limits, without torques."""
+    missing = {what for joint in arm.planned for what in joint.missing}
+    middle = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
+    robot = RobotSpec(
+        urdf=str(arm.urdf.absolute()),
+        joints=tuple(joint.name for joint in arm.planned),
+        tip=arm.tip,
+        base=middle,
+        geometry="urdf" if arm.has_shape else "paper-capsules",
+        packages=packages,
+    )
+    limits = LimitSpec(
+        velocity_scale=0.8,
+        torque_scale=0.8,
+        position=tuple(Range(each.lower, each.upper) for each in arm.planned) if "position" in missing else None,
+        velocity=PerJoint(tuple(each.velocity for each in arm.planned)) if "velocity" in missing else None,
+        torque=PerJoint(tuple(each.effort for each in arm.planned)) if "torque" in missing else None,
+    )
+    constraints: tuple[Constraint, ...] = (
+        JointPosition(tolerance=1e-3),
+        JointVelocity(tolerance=2e-3, budget=6e-3),
+        JointAcceleration(tolerance=5e-3, budget=6e-2),
+    )
+    if arm.has_shape:
+        constraints = (*constraints, SelfClearance(tolerance=1e-3, budget=1e-6))
+    path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
+    return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
+
+
+def _has_masses(robot: Robot) -> bool:
+    """Whether every joint moves something that has a mass: else torques mean nothing."""
+    return robot.chain.joints[-1].mass > 0
+
+
+def _torques(robot: Robot) -> list[float]:
+    """Return the largest torques [N m] at random states, at speeds and accelerations within the limits."""
+    import pinocchio as pin
+
+    model, random = robot.model, np.random.default_rng(0)
+    data = model.createData()
+    q = random.uniform(robot.position_lower, robot.position_upper, (STATES, robot.n))
+    dq, ddq = (
+        random.uniform(-limit, limit, (STATES, robot.n)) for limit in (robot.velocity_limit, robot.acceleration_limit)
+    )
+    most = np.abs([pin.rnea(model, data, *state) for state in zip(q, dq, ddq, strict=True)]).max(axis=0)
+    return [float(max(1, math.ceil(each))) for each in most]
+
+
+def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
+    """Return the stages; the boxes are still to be found."""
+    anywhere = (Range(0.0, 0.0),) * 3
+    torques = any(isinstance(each, JointTorque) for each in problem.constraint)
+    holding = {end: (GravityTorque(end=end),) if torques else () for end in ("start", "goal")}
+    return (
+        DrawPositions(start=anywhere, goal=anywhere),
+        StartIK(guess=tuple(_near(joint, at) for joint, at in zip(arm.planned, problem.robot.base, strict=True))),
+        *holding["start"],
+        GoalIK(),
+        *holding["goal"],
+        AtRest(end="start"),
+        AtRest(end="goal"),
+    )
+
+
+def _near(joint: Joint, at: float) -> Range:
+    half = SLIDE if joint.kind == "prismatic" else TURN
+    return Range(round(max(at - half, joint.lower), 4), round(min(at + half, joint.upper), 4))

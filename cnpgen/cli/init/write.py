@@ -1,0 +1,107 @@
+"""The three recipe files of an arm, with what was found out about it as comments."""
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from cnpgen.cli.describe import table
+from cnpgen.cli.init.arm import SLIDE, SPEED, TURN, Arm
+from cnpgen.cli.init.recipes import STATES
+from cnpgen.cli.init.text import recipe_text
+from cnpgen.cli.shape_rows import link_rows, pair_rows
+from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
+
+FILES = ("problem.toml", "pipeline.toml", "dataset.toml")
+
+_UNITS = 'A number without a unit is in SI; "20 ms", "[-170, 170] deg" or "5 %" is converted.'
+_KEYS = "Every key is explained above it; one that is left out stands there as a comment. All keys, and all kinds of"
+_WHERE = "constraints and stages: 'cnpgen show --keys'."
+
+
+def texts_of(recipe: DatasetRecipe, arm: Arm, share: float, folder: Path) -> dict[str, str]:
+    """Write the recipes of an arm.
+
+    Args:
+        recipe: The dataset, with its pipeline and its problem.
+        arm: The arm.
+        share: Which share of draws is accepted.
+        folder: The folder that the files are for.
+
+    Returns:
+        Name of the file -> its text.
+    """
+    problem = recipe.pipeline.problem
+    places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
+    places["robot.packages"] = tuple(_from(folder, each) for each in problem.robot.packages)
+    draws = {
+        "stage.0.start": f"Found by sampling: of the draws {100 * share:.0f} % become samples.",
+        "stage.1.guess": "About the base configuration of the problem.",
+    }
+    heads = {
+        FILES[0]: [*_head(f"What a valid motion of {arm.urdf.name} is."), "#", *_about(arm, load_robot(problem))],
+        FILES[1]: _head("How starts and goals are drawn: positions, and joint angles that reach them."),
+        FILES[2]: _head("How many samples there are, from which seed, split how."),
+    }
+    texts = (
+        recipe_text(problem, places, _notes(arm)),
+        recipe_text(recipe.pipeline, {"problem": FILES[0]}, draws),
+        recipe_text(recipe, {"pipeline": FILES[1]}, {}),
+    )
+    return {name: "\n".join([*head, "", text]) for (name, head), text in zip(heads.items(), texts, strict=True)}
+
+
+def _from(folder: Path, path: str) -> str:
+    """Return a path as the recipes name it."""
+    return os.path.relpath(path, folder.absolute())
+
+
+def _head(title: str) -> list[str]:
+    return [f"# {title}", f"# {_KEYS}", f"# {_WHERE}", f"# {_UNITS}"]
+
+
+def _notes(arm: Arm) -> Mapping[str, str]:
+    """Say which values were put in the place of missing ones, and how others were found."""
+    ranges = f"{TURN:.3g} rad, or {SLIDE:g} m, to either side"
+    torques = f"the largest of {STATES:,} random states, at speeds and accelerations within the limits"
+    put = {"position": ranges, "velocity": f"{SPEED:g} rad/s or m/s", "torque": torques}
+    base = "Found by sampling: in front of the robot, far from its limits, with much room to move."
+    notes = {"robot.base": base}
+    for what, instead in put.items():
+        without = [joint.name for joint in arm.planned if what in joint.missing]
+        if without:
+            notes[f"limits.{what}"] = f"The URDF has none for {', '.join(without)}: put in: {instead}. Look them up."
+    return notes
+
+
+def _about(arm: Arm, robot: Robot) -> Iterator[str]:
+    """Say what was found out about an arm."""
+    yield f"# What was found in {arm.urdf.name}"
+    yield "#"
+    yield from table(list(_joint_rows(arm)), indent="#   ", right=(2, 3, 4))
+    yield "#"
+    heavy = [link for link in arm.moved if arm.masses.get(link)]
+    light = [link for link in arm.moved if not arm.masses.get(link)]
+    mass = sum(arm.masses[link] for link in heavy)
+    facts = [("locked", f"joints that are not planned and stay at zero: {', '.join(arm.locked) or 'none'}")]
+    facts += [("mass", f"{mass:.4g} kg in {len(heavy)} links that move; without any: {', '.join(light) or 'none'}")]
+    if not robot.chain.joints[-1].mass:
+        facts += [("torque", "the last joint moves nothing that has a mass, so that 'joint-torque' is left out")]
+    facts += [("frames", ", ".join(arm.frames))]
+    if robot.shape is None:
+        facts += [("shape", "no link that moves has a <collision> element, so that 'self-clearance' is left out")]
+    yield from table(facts, indent="#   ")
+    if robot.shape is not None:
+        yield from ("#", "#   Links: capsules round them are for solvers, judges look at the pieces", "#")
+        yield from table(link_rows(robot.shape), indent="#   ", right=range(1, 6))
+        yield from ("#", "#   Pairs of links, by random states", "#")
+        yield from table(pair_rows(robot.shape), indent="#   ", right=(2, 3))
+
+
+def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
+    yield "joint", "type", "position [rad, m]", "velocity [/s]", "torque [N m, N]", "not in the URDF"
+    for joint in arm.planned:
+        limits = (f"{joint.lower:.4g} to {joint.upper:.4g}", f"{joint.velocity:.4g}", f"{joint.effort:.4g}")
+        yield joint.name, joint.kind, *limits, ", ".join(joint.missing)

@@ -1,0 +1,79 @@
+"""``cnpgen init``: a problem, a pipeline and a dataset for anybody's arm, from its URDF."""
+
+import argparse
+from pathlib import Path
+
+from cnpgen.cli.parser import Commands, Parser, add_command
+
+_TEXT = """\
+Writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two boxes of
+positions in front of the robot, within its limits and clear of itself. They work as they are, every key is explained in
+them, and what was found out about the robot is said at the top: joints, masses, frames, links and their pairs, limits
+that the URDF does not have and what was put in. docs/your-arm.md goes on from there.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "init", run, title="write recipes for an arm of your own", text=_TEXT)
+    option = parser.add_argument
+    option("name", metavar="NAME", help="what the recipes are called, and the folder that they are written to")
+    option("--urdf", metavar="FILE", type=Path, required=True, help="the robot; the recipes refer to it where it is")
+    option(
+        "--tip", metavar="FRAME", help="link or joint that the task is about; default the only link that carries none"
+    )
+    text = "a folder in which package:// in the URDF is looked up; can be given more than once"
+    option("--packages", metavar="DIR", type=Path, action="append", default=[], help=text)
+    option("--force", action="store_true", help="write over files that are there")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.cli.init.arm import read_arm
+    from cnpgen.cli.init.recipes import dataset_of
+    from cnpgen.cli.init.write import FILES, texts_of
+    from cnpgen.store.files.atomic import write_file
+
+    folder = _folder(arguments.name)
+    there = [str(folder / name) for name in FILES if (folder / name).exists()]
+    _refuse(there if not arguments.force else [])
+    arm = read_arm(arguments.urdf, arguments.tip)
+    recipe, arm, share = dataset_of(arm, folder.name, folder, tuple(arguments.packages))
+    for name, text in texts_of(recipe, arm, share, folder).items():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / name, text)
+        print(folder / name)
+    _say_next(folder)
+    return 0
+
+
+def _folder(name: str) -> Path:
+    """Return the folder of recipes of a name, which may be a path."""
+    import re
+
+    from cnpgen.errors import UsageError
+    from cnpgen.schema.keys import NAME
+
+    folder = Path(name)
+    if not re.match(NAME, folder.name):
+        raise UsageError(f"NAME must be lower-case letters, digits and hyphens, such as my-arm; got {name!r}")
+    return folder
+
+
+def _refuse(there: list[str]) -> None:
+    from cnpgen.errors import UsageError
+
+    if there:
+        raise UsageError(f"{', '.join(there)} exists already: --force writes over it")
+
+
+def _say_next(folder: Path) -> None:
+    import sys
+
+    lines = [
+        f"cnpgen show {folder}/dataset.toml               what is in them",
+        f"cnpgen make-dataset {folder}/dataset.toml --n 1000",
+        f"cnpgen solve {folder}/pipeline.toml --n 10 -o {folder.name}-plans.h5",
+        f"cnpgen view {folder}/problem.toml -o {folder.name}.html",
+    ]
+    print("next:", *lines, sep="\n  ", file=sys.stderr)

@@ -1,0 +1,1 @@
+"""``cnpgen view``: robots, plans and rows as a page that any browser opens."""

@@ -1,0 +1,133 @@
+"""The scene of a page: the robot at some moments, with its obstacles, and how its joints fare against their limits."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.cli.view.bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
+from cnpgen.judges.plans.plot import along, shares_of_limits
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.hull import CUBE
+from cnpgen.world.trace import trace
+
+Array = NDArray[np.float64]
+
+MOMENTS = 240  # of a motion
+DEEP = 1.0  # m: how far down obstacles without a lower end are drawn
+THIN = 5e-3  # m: what a table is drawn as thick as
+LINE = 4e-3  # m: radius of the line that the tip draws
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a page shows.
+
+    Attributes:
+        title: What it is of.
+        moments: What each of the K moments is called: its time, "start", "goal".
+        times: The moments [s], shape (K,); those of states that no motion joins are 0, 1, ...
+        poses: Where the joints are, the universe first and the tip last, shape (K, joints, 4, 4).
+        robot: Bodies of the robot, and what they are.
+        capsules: Capsules round its links.
+        world: Obstacles, the table, the path of the tip.
+        held: The held object, in the tip's frame.
+        joints: Names of the planned joints.
+        shares: Quantity -> share of the limits, shape (n, K); nothing where there is no motion.
+    """
+
+    title: str
+    moments: tuple[str, ...]
+    times: Array
+    poses: Array
+    robot: tuple[Body, ...]
+    kind: str
+    capsules: tuple[Body, ...]
+    world: tuple[Body, ...]
+    path: tuple[Body, ...]
+    held: tuple[Body, ...]
+    joints: tuple[str, ...]
+    shares: dict[str, Array]
+
+
+def scene_of_problem(problem: Problem, robot: Robot) -> Scene:
+    """Show a robot in its base configuration."""
+    q = robot.base[:, None]
+    return _scene(problem, robot, f"{problem.name}: base configuration", q, moments=("base",), times=np.zeros(1))
+
+
+def scene_of_plan(problem: Problem, robot: Robot, plans: Plans, title: str) -> Scene:
+    """Show the motion of one plan or, of a row without a plan, its start and its goal.
+
+    Raises:
+        UsageError: The plan has no course that could be drawn.
+    """
+    if not np.isfinite(plans.duration[0]):
+        boundary = plans.boundary
+        q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
+        return _scene(problem, robot, title, q, moments=("start", "goal"), times=np.arange(2.0))
+    world, _, times = along(problem, robot, plans.motion, 0, samples=MOMENTS)
+    moments = tuple(f"{time:.3f} s" for time in times)
+    return _scene(problem, robot, title, world.q, moments=moments, times=times, shares=shares_of_limits(world))
+
+
+def _scene(
+    problem: Problem,
+    robot: Robot,
+    title: str,
+    q: Array,
+    *,
+    moments: tuple[str, ...],
+    times: Array,
+    shares: dict[str, Array] | None = None,
+) -> Scene:
+    poses = _poses(robot, q)
+    tip = poses[:, -1, :3, 3]
+    bodies, kind = robot_bodies(problem, robot)
+    size = problem.object_size
+    return Scene(
+        title=title,
+        moments=moments,
+        times=times,
+        poses=poses,
+        robot=tuple(bodies),
+        kind=kind,
+        capsules=tuple(capsule_bodies(robot)),
+        world=tuple(_world(problem, obstacle_tops(problem, tip[0], tip[-1]))),
+        path=(tube("path of the tip", tip, LINE),) if shares else (),
+        held=() if size is None else (wrapped("object", robot.n + 1, CUBE * np.array(size), 0.0),),
+        joints=robot.joint_names,
+        shares=shares or {},
+    )
+
+
+def _poses(robot: Robot, q: Array) -> Array:
+    """Return the poses of all joints and of the tip at K states, shape (K, n + 2, 4, 4)."""
+    n = robot.n
+    rotations, positions = trace(robot.model, robot.model.createData(), q, list(range(n + 1)), n_turned=n + 1)
+    poses = np.zeros((q.shape[1], n + 2, 4, 4))
+    for joint, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
+        poses[:, joint, :3, :3], poses[:, joint, :3, 3] = rotation.transpose(2, 0, 1), position.T
+    poses[..., 3, 3] = 1.0
+    poses[:, -1] = poses[:, n] @ robot.model.frames[robot.tip_frame].placement.homogeneous
+    return poses
+
+
+def _world(problem: Problem, tops: Array) -> Iterator[Body]:
+    """Draw obstacles, and a table."""
+    for box, top in zip(problem.obstacle, tops.tolist(), strict=True):
+        low, high = (box.x.low, box.y.low, top - (box.height or DEEP)), (box.x.high, box.y.high, top)
+        yield _box(box.name, np.array(low), np.array(high))
+    for each in problem.constraint:
+        if isinstance(each, Table):
+            low, high = (each.x.low, each.y.low, each.z - THIN), (each.x.high, each.y.high, each.z)
+            yield _box("table", np.array(low), np.array(high))
+
+
+def _box(name: str, low: Array, high: Array) -> Body:
+    return wrapped(name, 0, (low + high) / 2 + CUBE * (high - low), 0.0)

@@ -1,0 +1,273 @@
+"""Recipes for anybody's arm: they work as they are, explain every key, and say what is missing in the URDF."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.cli.describe_keys import part_of
+from cnpgen.cli.init.text import toml
+from cnpgen.cli.main import main
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem import resolved
+from cnpgen.problems.robot import load_robot
+from cnpgen.schema.keys import PerJoint, Range, keys
+from cnpgen.world.state import World
+from tests.examples.example_robots import folder as robots
+from tests.examples.example_robots import needs_robots
+from tests.examples.shaped_robot import write_crane
+
+IIWA = Path(__file__).parents[2] / "problems" / "airhockey" / "iiwa14_striker.urdf"
+_INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/>'
+
+
+def write_arm(path: Path, joints: list[tuple[str, str, str]], *, mass: float = 2.0) -> Path:
+    """Write a URDF of links without shapes in a row: (type, axis, what is in the joint's element)."""
+    inertial = f'<inertial><mass value="{mass}"/>{_INERTIA}</inertial>' if mass else ""
+    parts = ['<robot name="arm"><link name="link_0"/>']
+    for number, (kind, axis, limit) in enumerate(joints, 1):
+        parts.append(f'<link name="link_{number}">{inertial}</link><joint name="joint_{number}" type="{kind}">')
+        parts.append(f'<parent link="link_{number - 1}"/><child link="link_{number}"/><axis xyz="{axis}"/>')
+        parts.append(f'<origin xyz="0.3 0 {0.3 if number == 1 else 0.0}"/>{limit}</joint>')
+    end = f'<parent link="link_{len(joints)}"/><child link="end"/><origin xyz="0.3 0 0"/>'
+    parts.append(f'<link name="end"/><joint name="end_joint" type="fixed">{end}</joint></robot>')
+    path.write_text("\n".join(parts))
+    return path
+
+
+LIMIT = '<limit lower="-2" upper="2" velocity="2" effort="90"/>'
+ELBOW = [("revolute", "0 0 1", LIMIT), ("revolute", "0 1 0", LIMIT), ("revolute", "0 1 0", LIMIT)]
+
+
+def proved(folder: Path) -> None:
+    """Check that a dataset of the recipes is what it is said to be."""
+    made = cnpgen.make_dataset(folder / "dataset.toml", folder / "rows", n=300, workers=1)
+    assert cnpgen.validate_dataset(made.folder, deep=True, workers=1).ok
+
+
+def solved(folder: Path, n: int) -> None:
+    """Check that all of some fresh problems of the recipes are solved."""
+    assert main(["solve", str(folder / "pipeline.toml"), "--n", str(n), "-o", str(folder / "plans.h5"), "--quiet"]) == 0
+    plans = cnpgen.load_plans(folder / "plans.h5")
+    assert cnpgen.evaluate_plans(plans, workers=1).valid.all()
+
+
+@pytest.fixture(scope="module")
+def crane(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("crane")
+    urdf = write_crane(folder)
+    assert main(["init", str(folder / "my-crane"), "--urdf", str(urdf), "--tip", "hand"]) == 0
+    return folder / "my-crane"
+
+
+def test_the_recipes_of_a_crane_work_as_they_are(crane):
+    proved(crane)
+    solved(crane, 8)
+
+
+def test_every_key_is_there_with_what_it_means(crane):
+    recipe = load_dataset_recipe(crane / "dataset.toml")
+    problem = recipe.pipeline.problem
+    files = {"problem.toml": [problem, problem.robot, problem.limits, problem.trajectory, *problem.constraint]}
+    files |= {"pipeline.toml": [recipe.pipeline, *recipe.pipeline.stage], "dataset.toml": [recipe]}
+    for name, tables in files.items():
+        text = (crane / name).read_text(encoding="utf-8")
+        flat = " ".join(line.removeprefix("# ") for line in text.splitlines())
+        for table in tables:
+            for key in (key for key in keys(type(table)) if part_of(key) is None):
+                assert key.doc in flat
+                assert f"\n{key.name} = " in text or f"\n# {key.name} = " in text
+
+
+def test_what_is_left_out_is_at_its_default(crane):
+    with (crane / "problem.toml").open("rb") as file:
+        said = tomllib.load(file)
+    assert said["limits"] == {"velocity_scale": 0.8, "torque_scale": 0.8}
+    assert said["robot"]["joints"] == ["swing", "lift", "elbow", "roll"]
+    assert {"object", "payload", "obstacle"}.isdisjoint(said)
+
+
+def test_what_was_found_out_is_said_at_the_top(crane):
+    text = (crane / "problem.toml").read_text(encoding="utf-8")
+    about = text[: text.index("\nname = ")]
+    assert re.search(r"swing +revolute +-2.5 to 2.5 +2 +100\n", about)
+    for found in ("stay at zero: grip", "5 kg in 5 links that move", "claw", "overhang [mm]"):
+        assert found in about
+    assert "kept apart by" in about
+    assert "of the draws" in (crane / "pipeline.toml").read_text(encoding="utf-8")
+
+
+def test_the_base_configuration_is_ahead_and_links_are_apart_there(crane):
+    robot = load_robot(load_problem(crane / "problem.toml"))
+    world = World(robot)
+    assert min(world.self_distances()) > 0
+    assert world.tip_position[0] > 0
+    assert (np.abs(world.holding_torque) < robot.torque_limit).all()
+
+
+def test_the_recipes_of_an_iiwa_make_datasets(tmp_path):
+    folder = tmp_path / "striker"
+    assert main(["init", str(folder), "--urdf", str(IIWA), "--tip", "striker_tip"]) == 0
+    proved(folder)
+
+
+@needs_robots
+@pytest.mark.extended  # two arms more, the claim of the crane's
+@pytest.mark.parametrize(
+    ("file", "tip"),
+    [("panda_description/urdf/panda.urdf", "panda_hand_tcp"), ("ur_description/urdf/ur5_robot.urdf", "tool0")],
+)
+def test_the_recipes_of_arms_that_people_have_work_as_they_are(file, tip, tmp_path):
+    urdf = robots() / "example-robot-data" / "robots" / file
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", tip]) == 0
+    proved(tmp_path / "arm")
+    solved(tmp_path / "arm", 8)
+
+
+def test_limits_that_are_missing_are_put_in_and_said(tmp_path):
+    joints = [("continuous", "0 0 1", ""), ELBOW[1], ("revolute", "0 1 0", '<limit velocity="0" effort="0"/>')]
+    urdf = write_arm(tmp_path / "arm.urdf", joints)
+    assert main(["init", str(tmp_path / "bare"), "--urdf", str(urdf)]) == 0
+    text = " ".join((tmp_path / "bare" / "problem.toml").read_text(encoding="utf-8").replace("\n#", " ").split())
+    assert text.count("The URDF has none for joint_1, joint_3: put in:") == 3
+    limits = load_problem(tmp_path / "bare" / "problem.toml").limits
+    assert limits.position[1] == Range(-2, 2)
+    assert np.allclose([limits.position[0].low, limits.position[0].high], [-np.pi, np.pi])
+    assert limits.velocity == PerJoint((1.0, 2.0, 1.0))
+    assert limits.torque.values[1] == 90
+    assert min(limits.torque.values) >= 1
+
+
+def test_without_masses_and_shapes_their_constraints_are_left_out(tmp_path):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW, mass=0.0)
+    assert main(["init", str(tmp_path / "light"), "--urdf", str(urdf)]) == 0
+    problem = load_problem(tmp_path / "light" / "problem.toml")
+    assert [type(each).__name__ for each in problem.constraint] == [
+        "JointPosition",
+        "JointVelocity",
+        "JointAcceleration",
+    ]
+    text = (tmp_path / "light" / "problem.toml").read_text(encoding="utf-8")
+    assert "'joint-torque' is left out" in text
+    assert "'self-clearance' is left out" in text
+
+
+def test_an_arm_of_sliding_joints_has_boxes_within_its_reach(tmp_path):
+    slide = '<limit lower="0" upper="1" velocity="1" effort="200"/>'
+    urdf = write_arm(tmp_path / "gantry.urdf", [("prismatic", axis, slide) for axis in ("1 0 0", "0 1 0", "0 0 1")])
+    assert main(["init", str(tmp_path / "gantry"), "--urdf", str(urdf)]) == 0
+    goal = load_dataset_recipe(tmp_path / "gantry" / "dataset.toml").pipeline.stage[0].goal
+    assert goal[1].low > 0
+
+
+def test_the_urdf_and_packages_are_named_from_the_recipes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").mkdir()
+    write_arm(tmp_path / "robots" / "arm.urdf", ELBOW)
+    (tmp_path / "meshes").mkdir()
+    assert main(["init", "recipes/arm", "--urdf", "robots/arm.urdf", "--packages", "meshes"]) == 0
+    robot = load_problem(tmp_path / "recipes" / "arm" / "problem.toml").robot
+    assert (robot.urdf, robot.packages) == ("../../robots/arm.urdf", ("../../meshes",))
+
+
+def refused(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> str:
+    assert main(["init", *map(str, words)]) == code
+    return capsys.readouterr().err
+
+
+def test_a_frame_that_is_not_there_is_refused_with_all_that_are(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf, "--tip", "ends")
+    assert (
+        "--tip: arm.urdf has no frame 'ends' (did you mean 'end'?); its frames: link_0, link_1, link_2, link_3, end,"
+        in said
+    )
+    assert not (tmp_path / "arm").exists()
+
+
+def test_several_links_that_carry_none_are_listed(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    camera = (
+        '<link name="camera"/><joint name="holder" type="fixed"><parent link="link_3"/><child link="camera"/></joint>'
+    )
+    urdf.write_text(urdf.read_text().replace("</robot>", f"{camera}</robot>"))
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
+    assert "--tip says which frame of arm.urdf the task is about: 2 links carry no other: end, camera" in said
+
+
+def test_a_frame_that_nothing_moves_is_refused(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    assert "no joint moves the frame 'link_0'" in refused(
+        capsys, 2, tmp_path / "arm", "--urdf", urdf, "--tip", "link_0"
+    )
+
+
+def test_xacro_is_refused(tmp_path, capsys):
+    xacro = tmp_path / "arm.urdf.xacro"
+    xacro.write_text('<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="x"/></robot>')
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", xacro)
+    assert "is to be read by xacro, expected a URDF: run 'xacro arm.urdf.xacro > robot.urdf'" in said
+
+
+def test_a_file_that_is_missing_or_no_urdf_is_refused(tmp_path, capsys):
+    assert "no such file" in refused(capsys, 2, tmp_path / "arm", "--urdf", tmp_path / "none.urdf")
+    (tmp_path / "text.urdf").write_text("no XML")
+    assert "it is not XML" in refused(capsys, 2, tmp_path / "arm", "--urdf", tmp_path / "text.urdf")
+
+
+def test_joints_in_a_circle_are_refused(tmp_path, capsys):
+    joint = '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/></joint>'
+    circle = joint.format("one", "a", "b") + joint.format("two", "b", "a")
+    (tmp_path / "arm.urdf").write_text(f'<robot name="r"><link name="a"/><link name="b"/>{circle}</robot>')
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", tmp_path / "arm.urdf", "--tip", "a")
+    assert "its joints go round in a circle" in said
+
+
+def test_a_tip_that_reaches_no_box_is_refused(tmp_path, capsys):
+    pan_tilt = [("revolute", "0 0 1", LIMIT), ("revolute", "0 1 0", LIMIT)]
+    urdf = write_arm(tmp_path / "arm.urdf", pan_tilt)
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
+    assert "does the tip reach 2%; choose another --tip" in said
+
+
+def test_files_that_are_there_are_written_over_only_by_force(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "arm" / "pipeline.toml").write_text("mine")
+    assert "exists already: --force writes over it" in refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
+    assert (tmp_path / "arm" / "pipeline.toml").read_text() == "mine"
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--force"]) == 0
+    assert resolved(load_dataset_recipe(tmp_path / "arm" / "dataset.toml"))["splits"] == {
+        "train": 18000,
+        "validation": 2000,
+    }
+
+
+def test_a_name_that_no_recipe_may_have_is_refused(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    assert "NAME must be lower-case letters" in refused(capsys, 2, tmp_path / "My Arm", "--urdf", urdf)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (Range(0.1, 2.0), "[0.1, 2.0]"),
+        (PerJoint((1.0,)), "1.0"),
+        (PerJoint((1.0, 2.0)), "[1.0, 2.0]"),
+        ((Range(0.0, 1.0), Range(2.0, 2.0)), "[[0.0, 1.0], [2.0, 2.0]]"),
+        (('a "b"', "c"), '["a \\"b\\"", "c"]'),
+        ({"train": 9, "validation": 1}, "{ train = 9, validation = 1 }"),
+        (1e-6, "1e-06"),
+        (7, "7"),
+        (None, ""),
+        ((), ""),
+    ],
+)
+def test_a_value_is_written_as_toml_reads_it(value, text):
+    assert toml(value) == text
+    if text:
+        tomllib.loads(f"key = {text}")

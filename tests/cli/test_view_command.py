@@ -1,0 +1,247 @@
+"""Pages that any browser opens: what is in them is what Pinocchio says, and Chromium draws it."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import cnpgen
+from cnpgen.cli.main import main
+from cnpgen.cli.view.bodies import robot_bodies, tube, wrapped
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
+from tests.conftest import HANGING
+from tests.examples.shaped_robot import WEDGE, write_problem
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+
+
+def _has_meshcat() -> bool:
+    try:
+        metadata.distribution("meshcat")
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+needs_meshcat = pytest.mark.skipif(not _has_meshcat(), reason="MeshCat is not installed")
+
+
+def content(page: Path) -> dict[str, Any]:
+    """What a page shows."""
+    text = page.read_text(encoding="utf-8")
+    found: dict[str, Any] = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.S)[1])
+    return found
+
+
+def array(text: str, dtype: str, *shape: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), dtype).reshape(shape)
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two plans of a carried object, from the shipped planner."""
+    folder = tmp_path_factory.mktemp("view")
+    made = cnpgen.make_dataset("heavy-object", folder / "rows", n=40, workers=1)
+    assert main(["plan", str(made.folder), "--model", "heavy-object", "--n", "2", "-o", str(folder / "plans.h5")]) == 0
+    return folder / "plans.h5"
+
+
+@pytest.fixture(scope="module")
+def page(plans: Path) -> Path:
+    assert main(["view", str(plans), "--row", "1", "-o", str(plans.with_name("plan.html"))]) == 0
+    return plans.with_name("plan.html")
+
+
+@needs_meshcat
+def test_the_joints_of_a_plan_are_where_pinocchio_has_them(page, plans):
+    shown, problem = content(page), load_problem("heavy-object")
+    robot, motion = load_robot(problem), cnpgen.load_plans(plans).motion[1:2]
+    poses = array(shown["poses"], "<f4", -1, shown["joints_and_tip"], 4, 4).transpose(0, 1, 3, 2)
+    assert len(poses) == len(shown["times"]) == len(shown["moments"]) == 240
+    assert shown["times"][-1] == pytest.approx(motion.duration()[0])
+    data = robot.model.createData()
+    for k in (0, 100, 239):
+        q = motion.at_times(np.array([[shown["times"][k]]])).q[0, 0]
+        pin.framesForwardKinematics(robot.model, data, q)
+        np.testing.assert_allclose(poses[k, 3], data.oMi[3].homogeneous, atol=1e-6)
+        np.testing.assert_allclose(poses[k, -1], data.oMf[robot.model.getFrameId("object")].homogeneous, atol=1e-6)
+
+
+@needs_meshcat
+def test_the_curves_are_shares_of_the_limits(page, plans):
+    shown, robot = content(page), load_robot(load_problem("heavy-object"))
+    curves = {curve["name"]: np.array(curve["shares"]) for curve in shown["curves"]}
+    assert list(curves) == ["position", "velocity", "acceleration", "torque"]
+    states = cnpgen.load_plans(plans).motion[1:2].at_times(np.array([shown["times"]]))
+    np.testing.assert_allclose(curves["velocity"], states.dq[0].T / robot.velocity_limit[:, None], atol=1e-4)
+    data = robot.model.createData()
+    torque = pin.rnea(robot.model, data, *(each[0, 120] for each in (states.q, states.dq, states.ddq)))
+    np.testing.assert_allclose(curves["torque"][:, 120], torque / robot.torque_limit, atol=1e-4)
+
+
+@needs_meshcat
+def test_obstacles_the_object_and_the_path_are_shown(page):
+    shown = content(page)
+    assert [body["name"] for body in shown["world"]] == ["pedestal-1", "pedestal-2"]
+    assert [(body["name"], body["joint"]) for body in shown["held"]] == [("object", 8)]
+    assert [body["name"] for body in shown["path"]] == ["path of the tip"]
+    assert shown["title"] == "heavy-object: plans.h5, plan 1"
+
+
+@needs_meshcat
+def test_a_page_asks_no_network(page):
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
+
+
+@needs_meshcat
+def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(plans, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    folder = plans.with_name("rows")
+    assert main(["view", str(folder), "--split", "train", "--row", "3"]) == 0
+    assert capsys.readouterr().out == "rows.html\n"
+    shown = content(tmp_path / "rows.html")
+    assert (shown["moments"], shown["curves"]) == (["start", "goal"], [])
+    tips = array(shown["poses"], "<f4", 2, -1, 4, 4)[:, -1, 3, :3]
+    rows = cnpgen.load_dataset(folder).arrays("train", fields=["start_xyz", "goal_xyz"])
+    np.testing.assert_allclose(tips, [rows["start_xyz"][3], rows["goal_xyz"][3]], atol=1e-6)
+
+
+@needs_meshcat
+def test_a_problem_is_shown_in_its_base_configuration(tmp_path):
+    assert main(["view", "airhockey", "-o", str(tmp_path / "arm.html")]) == 0
+    shown = content(tmp_path / "arm.html")
+    assert (shown["moments"], shown["note"]) == (
+        ["base"],
+        "drawn as the line through its joints' origins that stands for it",
+    )
+    assert [body["name"] for body in shown["world"]] == ["table"]
+    assert len(shown["robot"]) > 3
+
+
+@needs_meshcat
+def test_a_robot_with_a_shape_has_capsules(tmp_path):
+    assert main(["view", str(write_problem(tmp_path)), "-o", str(tmp_path / "crane.html")]) == 0
+    shown = content(tmp_path / "crane.html")
+    assert shown["note"].startswith("drawn as judges see it")
+    assert {body["name"] for body in shown["capsules"]} == {body["name"] for body in shown["robot"]}
+    assert [body["name"] for body in shown["world"]] == ["wall", "roof"]
+
+
+def _with_visual(folder: Path, name: str) -> Path:
+    file = write_problem(folder)
+    urdf = folder / "crane" / "crane.urdf"
+    mesh = f'<mesh filename="{name}" scale="0.001 0.001 0.001"/>'
+    visual = f'<visual><origin xyz="0.1 0 0"/><geometry>{mesh}</geometry></visual>'
+    urdf.write_text(urdf.read_text().replace('<link name="fore">', f'<link name="fore">{visual}'))
+    return file
+
+
+def test_visual_meshes_are_shown_where_they_are_found(tmp_path):
+    problem = load_problem(_with_visual(tmp_path, "package://crane/meshes/wedge.stl"))
+    robot = load_robot(problem)
+    (body,), kind = robot_bodies(problem, robot)
+    assert (kind, body.name, body.joint, len(body.triangles)) == ("meshes", "fore", 3, 8)
+    np.testing.assert_allclose(body.corners.max(axis=0), WEDGE.max(axis=0) / 1000 + [0.1, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["meshes/none.stl", "meshes/broken.stl"])
+def test_without_its_meshes_a_robot_is_shown_as_judges_see_it(name, tmp_path):
+    problem = load_problem(_with_visual(tmp_path, name))
+    (tmp_path / "crane" / "meshes" / "broken.stl").write_bytes(b"no mesh")
+    assert robot_bodies(problem, load_robot(problem))[1] == "pieces"
+
+
+def volume(body) -> float:
+    a, b, c = (body.corners[body.triangles[:, side]] for side in range(3))
+    return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize(
+    ("corners", "radius", "expected"),
+    [
+        ([[0, 0, 0]], 0.5, 4 / 3 * np.pi * 0.5**3),
+        ([[0, 0, 0], [0, 0, 1]], 0.2, 4 / 3 * np.pi * 0.2**3 + np.pi * 0.2**2),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], 0.0, 1 / 6),
+    ],
+)
+def test_a_body_is_closed_and_its_triangles_face_outwards(corners, radius, expected):
+    assert volume(wrapped("body", 0, np.array(corners, float), radius)) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_line_is_a_tube_round_its_points():
+    points = np.stack([np.linspace(0, 1, 20), np.sin(np.linspace(0, 3, 20)), np.linspace(0, 0.5, 20)], axis=1)
+    body = tube("line", points, 0.01)
+    away = np.linalg.norm(body.corners.reshape(20, 6, 3) - points[:, None], axis=2)
+    np.testing.assert_allclose(away, 0.01, rtol=1e-9)
+    assert body.triangles.max() == len(body.corners) - 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["airhockey", "--row", "1"], "--row is for plans and for the folder of a dataset, got airhockey"),
+        (["airhockey", "--split", "train"], "--split is for the folder of a dataset, got airhockey"),
+        (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
+        (["airhokey"], "unknown problem, pipeline or dataset 'airhokey' (did you mean 'airhockey'?)"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(words, said, capsys):
+    assert main(["view", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_plan_that_is_not_there_is_refused(plans, capsys):
+    assert main(["view", str(plans), "--row", "2"]) == 2
+    assert "has no plan 2: 2 plans are numbered from 0" in capsys.readouterr().err
+
+
+def test_without_the_viewer_it_is_said_what_to_install(monkeypatch, capsys):
+    def missing(name: str) -> None:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", missing)
+    assert main(["view", "airhockey"]) == 3
+    assert "pip install 'cnpgen[view]'" in capsys.readouterr().err
+
+
+def chromium(page: Path, *options: str) -> str:
+    """Open a page from disk in a browser without a screen; return what it prints."""
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
+    flags += ["--disable-sync", f"--user-data-dir={page.parent / 'browser'}", "--window-size=1200,700"]
+    command = [str(CHROMIUM), *flags, "--virtual-time-budget=8000", *options, f"{page.as_uri()}#moment=120&ends"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
+    return done.stdout
+
+
+@needs_meshcat
+@needs_chromium
+def test_a_browser_runs_the_page(page):
+    found = chromium(page, "--dump-dom")
+    assert 'data-ready="yes"' in found
+    assert content(page)["moments"][120] in re.search(r'<output id="moment">(.*?)</output>', found)[1]
+    assert found.count("<canvas") == 5  # the scene, and four curves
+
+
+@needs_meshcat
+@needs_chromium
+def test_a_browser_draws_the_arm_its_start_and_its_goal(page):
+    image = pytest.importorskip("matplotlib.image")
+    picture = page.with_suffix(".png")
+    chromium(page, f"--screenshot={picture}")
+    scene = image.imread(picture)[60:560, 20:780, :3]
+    red, blue = scene[..., 0], scene[..., 2]
+    assert (blue > red + 0.15).mean() > 0.005  # the start
+    assert (red > blue + 0.2).mean() > 0.01  # the goal and the object
+    assert (np.ptp(scene, axis=2) < 0.03).mean() > 0.3  # the arm, and nothing
