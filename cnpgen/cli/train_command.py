@@ -58,6 +58,21 @@ def _add_how(parser: Parser) -> None:
     option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
     option("--growth", metavar="X", type=float, help="by which factor ramped weights grow in the run (default: 30)")
     option(
+        "--margin",
+        metavar="TERM=X",
+        type=_margin,
+        action="append",
+        help="train with limits X times those of the problem, such as joint-acceleration=0.96 (default: 0.985; of"
+        " joint-velocity 0.99); may be repeated",
+    )
+    option(
+        "--expected-time",
+        choices=("distance", "reach"),
+        help="what motion times are a multiple of: the time of the distance at the velocity limits, or that in which"
+        " joints could reach their goal states (default: distance)",
+    )
+    option("--rate-bias", metavar="X", type=float, help="logarithm of the first guess of that factor (default: -0.5)")
+    option(
         "--imitate",
         metavar="X",
         type=float,
@@ -86,6 +101,18 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _margin(text: str) -> tuple[str, float]:
+    """Read TERM=X."""
+    term, sign, factor = text.partition("=")
+    try:
+        found = float(factor)
+    except ValueError:
+        found = -1.0
+    if not sign or not term or not 0 < found <= 1:
+        raise argparse.ArgumentTypeError(f"expected TERM=X with X above 0 and at most 1, got {text!r}")
+    return term, found
+
+
 def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     from cnpgen.training.train import train_model
 
@@ -109,12 +136,14 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
     from cnpgen.errors import UsageError
     from cnpgen.training.settings import METRICS, TrainingSettings
 
-    names = ("hidden", "layers", "batch_size", "learning_rate", "seed")
+    names = ("hidden", "layers", "batch_size", "learning_rate", "expected_time", "rate_bias", "seed")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     metric = METRICS[arguments.metric or "ramped"]
     if arguments.growth is not None and metric.kind == "fixed":
         raise UsageError("--growth changes nothing with --metric fixed, whose weights do not grow")
     given["metric"] = metric if arguments.growth is None else replace(metric, growth=arguments.growth)
+    if arguments.margin is not None:
+        given["margins"] = dict(arguments.margin)
     if arguments.imitate is not None:
         given["imitation"] = arguments.imitate
     return TrainingSettings(**given)
@@ -123,9 +152,10 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
     lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
-    names = (*lengths, *network, "metric", "growth", "imitate", "seed", "check")
+    names = (*lengths, *network, "metric", "growth", "expected_time", "rate_bias", "imitate", "seed", "check")
     default = arguments.parser.get_default
     said = [(name, getattr(arguments, name)) for name in names]
+    said[-2:-2] = [("margin", f"{term}={factor:g}") for term, factor in arguments.margin or ()]
     options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
     places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]
     return " ".join(["cnpgen train", places[0], "-o", places[1], *options])

@@ -1,6 +1,7 @@
 """Stage: certified samples, each with a plan that Pinocchio and Coal call valid."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -8,25 +9,37 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.plans.format import BOUNDARY
+from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.trajectory.boundary import Boundary
 
 NO_PLAN = "no plan found"
 
 
 @dataclass(frozen=True, kw_only=True)
 class CertifiedPlan(Stage):
-    """Solves every sample from nothing, with the problem's own objective, and keeps those with a valid plan."""
+    """Solves every sample, with the problem's own objective, and keeps those with a valid plan."""
 
     block_rows: ClassVar[int] = 64  # a sample takes some 30 ms: blocks of this stage must be small
     needs = (*BOUNDARY, "start_xyz", "goal_xyz")
+    model: str = field(
+        "the planner whose plans solving begins with, a shipped one or a file; none: from nothing",
+        default="",
+        late=True,
+    )
+    sha256: str = field(
+        "sha256 of the model's file: from another one come other plans", default="", pattern=SHA256, late=True
+    )
 
     def describe(self) -> str:
         """Say what is kept."""
+        origin = f"from the plan of {self.model!r}" if self.model else "from nothing"
         return (
-            "plan every sample from nothing (sequential quadratic programming, several starts) and keep those whose"
+            f"plan every sample {origin} (sequential quadratic programming, several starts) and keep those whose"
             " plan Pinocchio and Coal call valid on a time grid of 1 ms, with the plan"
         )
 
@@ -62,11 +75,13 @@ class CertifiedPlan(Stage):
         from cnpgen.refine.engine import load_solver
 
         solve = load_solver(context.problem, context.robot, context.kernels)
+        planner = load_stage_planner(self.model, self.sha256, context) if self.model else None
 
         def work(draws: Round, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
+            given = None if planner is None else planner.plan_batch(Boundary.from_batch(columns, None)).motion
             with one_thread():
-                motion, valid = solve(columns)
+                motion, valid = solve(columns, given)
             draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)
             draws["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
             draws["duration"] = motion.duration()[None]
@@ -75,9 +90,18 @@ class CertifiedPlan(Stage):
         return work
 
 
-def certified(recipe: DatasetRecipe) -> DatasetRecipe:
-    """Return the recipe of the certified dataset: one more stage, and a name that says so."""
+def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> DatasetRecipe:
+    """Return the recipe of the certified dataset: one more stage, and a name that says so.
+
+    Args:
+        recipe: The recipe; one that is of a certified dataset already stays as it is.
+        model: The planner whose plans solving begins with; by default it begins from nothing.
+
+    Raises:
+        UsageError: There is no such model.
+    """
     if any(isinstance(stage, CertifiedPlan) for stage in recipe.pipeline.stage):
         return recipe
-    pipeline = replace(recipe.pipeline, stage=(*recipe.pipeline.stage, CertifiedPlan()))
+    stage = CertifiedPlan() if model is None else CertifiedPlan(model=str(model), sha256=model_sha256(str(model)))
+    pipeline = replace(recipe.pipeline, stage=(*recipe.pipeline.stage, stage))
     return replace(recipe, name=f"{recipe.name}-certified", pipeline=pipeline)

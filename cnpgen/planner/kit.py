@@ -12,7 +12,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.curves import landed_path
 from cnpgen.planner.expressions import has_equalities
-from cnpgen.planner.model import Model
+from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
 from cnpgen.plans.plans import Plans
@@ -112,19 +112,19 @@ class Kit:
         )
 
 
-def make_kit(given: Surroundings, *, bending_steps: int, landing_steps: int, slow_down: bool) -> Kit:
+def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool) -> Kit:
     """Make the kit of a problem; without equalities there is nothing to bend onto.
 
     Args:
         given: The problem.
-        bending_steps: Gauss-Newton steps that bend the line.
-        landing_steps: Gauss-Newton steps behind the network.
+        meaning: What the network's outputs stand for.
         slow_down: Whether motions are slowed down; only for those from rest to rest.
     """
     problem, robot, kernels = given.problem, given.robot, given.kernels
     bent = has_equalities(kernels)
     with kernels.compiling_together():
-        prepare = prepare_tasks(problem, robot, kernels, bending_steps=bending_steps if bent else 0)
-        path = kernels.load(landed_path, steps=landing_steps if bent else 0)
+        steps, time = meaning.bending_steps if bent else 0, meaning.expected_time
+        prepare = prepare_tasks(problem, robot, kernels, bending_steps=steps, expected_time=time)
+        path = kernels.load(landed_path, steps=meaning.landing_steps if bent else 0)
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
     return Kit(prepare, path, slowing)

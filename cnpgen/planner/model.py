@@ -25,11 +25,14 @@ class Meaning:
         path_scale: What the configuration head's output is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line onto the manifold's equalities; none in the paper.
         landing_steps: Likewise of what the network gave.
+        expected_time: What its rates are multiples of the inverse of: the time of the "distance" at the velocity
+            limits, as in the paper, or the least time in which joints could "reach" their goal states.
     """
 
     path_scale: float
     bending_steps: int
     landing_steps: int
+    expected_time: str = "distance"
 
 
 @dataclass(frozen=True)

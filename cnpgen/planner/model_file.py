@@ -15,6 +15,7 @@ from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.features import BLOCKS, Features, count_features
+from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.documents import parse_json
@@ -94,7 +95,7 @@ def model_content(model: Model) -> Content:
     description = {
         "architecture": asdict(model.architecture),
         "features": list(model.features.blocks),
-        "meaning": asdict(model.meaning),
+        "meaning": {name: value for name, value in asdict(model.meaning).items() if value != "distance"},
         "rest": list(model.rest),
         "problem_sha256": model.problem.comparable_sha256,
     }
@@ -139,6 +140,8 @@ def _assembled(content: Content) -> Model:
     _check_sizes(problem, architecture, features)
     if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
         raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
+    if meaning.expected_time not in EXPECTED_TIMES:
+        raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {meaning.expected_time!r}")
     return Model(
         problem=problem,
         architecture=architecture,

@@ -53,13 +53,7 @@ class Planner:
         self._options: dict[str, Any] = {"slow_down": slow_down, "backend": backend}
         with surroundings(self.model.problem, backend) as given:
             self.robot = given.robot
-            meaning = self.model.meaning
-            self._kit = make_kit(
-                given,
-                bending_steps=meaning.bending_steps,
-                landing_steps=meaning.landing_steps,
-                slow_down=slow_down and self.model.rests,
-            )
+            self._kit = make_kit(given, self.model.meaning, slow_down=slow_down and self.model.rests)
             velocity, acceleration = given.robot.velocity_limit, given.robot.acceleration_limit
             self._still = {"start_dq": AT_REST * velocity, "start_ddq": AT_REST * acceleration}
             self._still["goal_dq"] = self._still["start_dq"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.curves import line_bend
-from cnpgen.planner.tasks import Tasks, expected_time
+from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.symbolic.state import tip_position
@@ -45,33 +45,44 @@ class Preparation:
     Attributes:
         problem: The problem.
         velocity_limit: Planning limits [rad/s], shape (n,).
+        acceleration_limit: Planning limits [rad/s^2], shape (n,).
         tip: Kernel of ``symbolic.state.tip_position``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
+        expected_time: Which of ``EXPECTED_TIMES`` is taken.
     """
 
     problem: Problem
     velocity_limit: Array
+    acceleration_limit: Array
     tip: Kernel
     line: Kernel | None
+    expected_time: str = "distance"
 
     def __call__(self, boundary: Boundary) -> Tasks:
         """Prepare N tasks, in float64."""
         ends = np.concatenate([boundary.start_q, boundary.goal_q])
         (tips,) = self.tip(np.ascontiguousarray(ends.T))
         start_xyz, goal_xyz = tips[:, : len(boundary)].T, tips[:, len(boundary) :].T
-        time = expected_time(boundary, self.velocity_limit)
+        time = self._time(boundary)
         correction = None
         if self.line is not None:
             (change,) = self.line(ends_of(boundary), 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
             correction = rows(change, boundary.start_q.shape[1])
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
 
+    def _time(self, boundary: Boundary) -> Array:
+        if self.expected_time == "distance":
+            return expected_time(boundary, self.velocity_limit)
+        return reaching_time(boundary, self.velocity_limit, self.acceleration_limit)
+
     def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
         """Heights of the obstacles' upper faces [m], shape (N, obstacles)."""
         return obstacle_tops(self.problem, start_xyz, goal_xyz)
 
 
-def prepare_tasks(problem: Problem, robot: "Robot", kernels: KernelLibrary, *, bending_steps: int) -> Preparation:
+def prepare_tasks(
+    problem: Problem, robot: "Robot", kernels: KernelLibrary, *, bending_steps: int, expected_time: str = "distance"
+) -> Preparation:
     """Load what tasks are prepared with.
 
     Args:
@@ -79,6 +90,8 @@ def prepare_tasks(problem: Problem, robot: "Robot", kernels: KernelLibrary, *, b
         robot: Its robot.
         kernels: Where kernels are loaded from.
         bending_steps: Gauss-Newton steps that bend the line; 0, as where there are no equalities, leaves it straight.
+        expected_time: Which of ``EXPECTED_TIMES`` is taken.
     """
     line = kernels.load(line_bend, steps=bending_steps) if bending_steps else None
-    return Preparation(problem, robot.velocity_limit, kernels.load(tip_position), line)
+    limits = robot.velocity_limit, robot.acceleration_limit
+    return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)

@@ -11,6 +11,8 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[Any]
 
 SHORTEST_TIME = 0.2  # s: floor of the expected time; what lies close together is not reached in no time at all
+SHORTEST_REACH = 0.03  # s: likewise of the time that velocities and accelerations need
+EXPECTED_TIMES = ("distance", "reach")  # what a model may take for the expected time: the two functions here
 
 
 @dataclass(frozen=True)
@@ -71,4 +73,32 @@ def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
     """
     each: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
     time: Array = np.maximum(each.max(axis=1), SHORTEST_TIME)
+    return time
+
+
+def reaching_time(boundary: Boundary, velocity_limit: Array, acceleration_limit: Array) -> Array:
+    """Least time in which every joint could go from its start to its goal state, at least ``SHORTEST_REACH`` [s].
+
+    Each joint for itself, with what is bounded of it: to its goal at full acceleration either way, at its velocity
+    limit between the two where it would exceed that. No motion is shorter but for the floor.
+
+    Args:
+        boundary: Boundary conditions.
+        velocity_limit: Planning limits [rad/s], shape (n,).
+        acceleration_limit: Planning limits [rad/s^2], shape (n,).
+
+    Returns:
+        Shape (N,).
+    """
+    first, last, way = boundary.start_dq, boundary.goal_dq, boundary.goal_q - boundary.start_q
+    direct = (first + last) * np.abs(last - first) / (2 * acceleration_limit)  # the way while it only changes speed
+    side = np.where(way >= direct, 1.0, -1.0)
+    first, last, way = side * first, side * last, side * way
+    squares = (first**2 + last**2) / 2
+    peak = np.sqrt(np.maximum(acceleration_limit * way + squares, 0.0))
+    fastest = np.maximum(velocity_limit, np.maximum(first, last))
+    turning = np.minimum(peak, fastest)
+    cruise = np.maximum(way - (fastest**2 - squares) / acceleration_limit, 0.0) / fastest
+    each: Array = (2 * turning - first - last) / acceleration_limit + np.where(peak > fastest, cruise, 0.0)
+    time: Array = np.maximum(each.max(axis=1), SHORTEST_REACH)
     return time

@@ -1,10 +1,10 @@
 """Building the refiner of a problem with all that it needs, and refining plans with it in one process."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,13 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
+
+
+class Solver(Protocol):
+    """What ``load_solver`` returns."""
+
+    def __call__(self, columns: Mapping[str, Array], given: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
+        """Make N motions; say which are valid."""
 
 
 def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
@@ -64,10 +71,8 @@ def tasks_of(plans: Plans) -> list[Task]:
     return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
 
 
-def load_solver(
-    problem: "Problem", robot: "Robot", kernels: KernelLibrary
-) -> Callable[[Mapping[str, Array]], tuple[Motion, NDArray[np.bool_]]]:
-    """Load what makes plans for rows of a dataset from nothing, with the problem's own objective, in one thread.
+def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> Solver:
+    """Load what makes plans for rows of a dataset with the problem's own objective, in one thread.
 
     Args:
         problem: The problem.
@@ -75,14 +80,16 @@ def load_solver(
         kernels: Where kernels are loaded from.
 
     Returns:
-        A function of the columns of N rows, shape (N, width) each, that returns N motions and which of them the
-        verdict calls valid, shape (N,).
+        A function of the columns of N rows, shape (N, width) each, and of N motions to begin with, from nothing by
+        default, that returns N motions and which of them the verdict calls valid, shape (N,).
     """
     refiner = load_refiner(problem, robot, kernels=kernels)
     jury, spec = Jury(problem, robot, degree=refiner.spec.degree), refiner.spec
 
-    def solve(columns: Mapping[str, Array]) -> tuple[Motion, NDArray[np.bool_]]:
+    def solve(columns: Mapping[str, Array], given: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
         tasks = _tasks(problem, Boundary.from_batch(columns, None), columns["start_xyz"], columns["goal_xyz"])
+        if given is not None:
+            tasks = [replace(each, path=given.path[i], rate=given.rate[i]) for i, each in enumerate(tasks)]
         found = [refine_task(refiner, jury, task) for task in tasks]
         path = np.array([each.path for each in found]).reshape(len(found), spec.path_control_points, robot.n)
         rate = np.array([each.rate for each in found]).reshape(len(found), spec.rate_control_points)

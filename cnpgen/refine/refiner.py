@@ -33,6 +33,7 @@ EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the e
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
+ROUNDS = 4  # from a motion that was slowed down; most need one
 FROM_NOTHING, CROWDED = 0.1, 0.05  # shares of the tolerance from nothing, where small steps still lead far
 
 
@@ -164,7 +165,7 @@ class Refiner:
             yield Attempt(first.x, 0.0, cost, outcome, first.iterations)  # most are valid; no need to measure
             best = self._measured(task, first.x, Outcome.SOLVED)
         else:
-            best = self._measured(task, first.x, outcome, first.iterations)
+            best = self._iterated_on(task, self._measured(task, first.x, outcome, first.iterations))
             yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED)
         yield polished
@@ -175,6 +176,20 @@ class Refiner:
         yield strict
         if not self.check.refutes_ends(task):
             yield from self._from_others(task, x, strict if strict.is_better(best) else best)
+
+    def _iterated_on(self, task: Task, best: Attempt) -> Attempt:
+        """Go on from a motion that had to be slowed down, for as long as that gains.
+
+        A slow-down makes a motion slower everywhere by what a single moment of it asks for.
+        """
+        for _ in range(ROUNDS):
+            if best.outcome is not Outcome.SLOWED:
+                break
+            again = self._attempt(task, self.passes.given, best.x, Outcome.SOLVED)
+            if not (again.excess <= 1 and again.cost < best.cost):
+                break
+            best = replace(again, iterations=best.iterations + again.iterations)
+        return best
 
     def _slowed_only(self, task: Task, given: Array | None) -> Attempt:
         x, outcome = (self.straight(task), Outcome.SOLVED) if given is None else (given, Outcome.ADJUSTED)

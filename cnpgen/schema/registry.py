@@ -27,12 +27,14 @@ CONTRACTS: dict[str, str] = {  # what a kind is a subclass of
 BUILT_IN: dict[str, dict[str, str]] = {
     STAGES: {
         "draw-positions": "cnpgen.pipelines.stages.draw:DrawPositions",
+        "draw-goal": "cnpgen.pipelines.stages.draw:DrawGoal",
         "given-positions": "cnpgen.pipelines.stages.given_positions:GivenPositions",
         "start-ik": "cnpgen.pipelines.stages.ik:StartIK",
         "goal-ik": "cnpgen.pipelines.stages.ik:GoalIK",
         "hit-angle-to-goal": "cnpgen.pipelines.stages.hit_angle:HitAngleToGoal",
         "hit-angle-in-cone": "cnpgen.pipelines.stages.hit_angle:HitAngleInCone",
         "behind-puck": "cnpgen.pipelines.stages.behind_puck:BehindPuck",
+        "home": "cnpgen.pipelines.stages.home:Home",
         "hitting-configuration": "cnpgen.pipelines.stages.hitting_configuration:HittingConfiguration",
         "hitting-velocity": "cnpgen.pipelines.stages.hitting_velocity:HittingVelocity",
         "at-rest": "cnpgen.pipelines.stages.motion:AtRest",
@@ -42,6 +44,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "braking-reach": "cnpgen.pipelines.stages.braking:BrakingReach",
         "collision": "cnpgen.pipelines.stages.collision:Collision",
         "gravity-torque": "cnpgen.pipelines.stages.torque:GravityTorque",
+        "start-on-plan": "cnpgen.make.on_plan:StartOnPlan",
+        "goal-of-plan": "cnpgen.make.on_plan:GoalOfPlan",
         "certified-plan": "cnpgen.make.certify:CertifiedPlan",
     },
     CONSTRAINTS: {

@@ -49,7 +49,7 @@ def prepare_run(
     """
     boundary = source.training()
     rest, spec = resting(boundary), given.problem.trajectory
-    kit = _kit(given, settings, slow_down=len(rest) == 3)  # all of them
+    kit = make_kit(given, settings.meaning, slow_down=len(rest) == 3)  # all of them
     rows, features = prepare_rows(boundary, kit.prepare)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
@@ -69,11 +69,6 @@ def prepare_run(
         training={"command": command, **identity(source, settings), "stages": source.dataset.blueprint.stages},
     )
     return run, kit
-
-
-def _kit(given: Surroundings, settings: TrainingSettings, *, slow_down: bool) -> Kit:
-    bending, landing = settings.bending_steps, settings.landing_steps
-    return make_kit(given, bending_steps=bending, landing_steps=landing, slow_down=slow_down)
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
@@ -111,7 +106,8 @@ def _landing(given: Surroundings, settings: TrainingSettings) -> Landing | None:
 def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
     backend = given.kernels.backend
     names = PlanLoss(given.problem, nodes=settings.nodes, backend=backend).terms  # its kernels are built when needed
-    margins = suggested_margins(names)
+    usual = suggested_margins(names)
+    margins = replace(usual, factors={**usual.factors, **settings.margins})
     loss = PlanLoss(given.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
     loss.load_kernels()  # so that no step is slow because of it
     return loss

@@ -12,7 +12,7 @@ from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_wait
-from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.model import Model
 from cnpgen.planner.network.features import Features
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.training.adam import learning_rate
@@ -98,17 +98,12 @@ class Run:
 
     def model(self, parameters: Array) -> Model:
         """Make a model of parameters."""
-        settings = self.learner.settings
         return Model(
             problem=self.problem,
             architecture=self.learner.architecture,
             parameters=parameters.astype(np.float32),
             features=self.features,
-            meaning=Meaning(
-                path_scale=settings.path_scale,
-                bending_steps=settings.bending_steps,
-                landing_steps=settings.landing_steps,
-            ),
+            meaning=self.learner.settings.meaning,
             rest=self.rest,
             training=self.training,
         )

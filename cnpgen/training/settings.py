@@ -1,11 +1,14 @@
 """How a model is trained."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
+from cnpgen.planner.model import Meaning
+from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.schema.arguments import integer, number
 
 METRICS = {
@@ -48,6 +51,8 @@ class TrainingSettings:
         batch_clip: Largest norm of a batch's gradient, in running norms.
         memory: Of the average of the parameters.
         metric: How the weights of the constraint terms change.
+        expected_time: What the network's rates are multiples of the inverse of; see ``Meaning``.
+        margins: Constraint term -> what its limits are multiplied by, in (0, 1], where not the usual factor.
         imitation: Fraction of the run, at its beginning, that imitates the plans of a certified dataset.
     """
 
@@ -69,6 +74,8 @@ class TrainingSettings:
     batch_clip: float = 2.0
     memory: float = 0.999
     metric: MetricSettings = field(default_factory=MetricSettings)
+    expected_time: str = "distance"
+    margins: Mapping[str, float] = field(default_factory=dict)
     imitation: float = 0.0
 
     def __post_init__(self) -> None:
@@ -77,11 +84,25 @@ class TrainingSettings:
         for name, interval in INTERVALS.items():
             _within(name, getattr(self, name), interval)
         _within("growth", self.metric.growth, "(0, inf)")
+        for term, factor in self.margins.items():
+            _within(f"margin of {term!r}", factor, "(0, 1]")
+        if self.expected_time not in EXPECTED_TIMES:
+            raise UsageError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {self.expected_time!r}")
 
     @property
     def form(self) -> str:
         """Form of the loss: "paper" where the metric is the paper's, whose budgets are meant for it, else "signed"."""
         return "paper" if self.metric.kind == "learned" and self.metric.every == "epoch" else "signed"
+
+    @property
+    def meaning(self) -> Meaning:
+        """What the network's outputs stand for."""
+        return Meaning(
+            path_scale=self.path_scale,
+            bending_steps=self.bending_steps,
+            landing_steps=self.landing_steps,
+            expected_time=self.expected_time,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -85,6 +85,7 @@ class _ShardCheck:
         keys: A hash of the boundary states of every row, shape (rows,).
         plans: What the verdict says of its plans.
         shares: Which fraction of the highest possible speed its hits have, shape (rows,); none if they are no hits.
+        goals: A key of the goal of each of these.
     """
 
     report: RowReport | None
@@ -92,6 +93,7 @@ class _ShardCheck:
     keys: NDArray[np.uint64]
     plans: PlanCheck
     shares: NDArray[np.float64]
+    goals: NDArray[np.uint64]
 
 
 def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _ShardCheck:
@@ -100,7 +102,7 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
         columns = read_shard(folder / task.file)
         record = load_record(folder, task)
     except CnpgenError as error:
-        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0))
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0), np.empty(0, np.uint64))
     with restored(blueprint) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
@@ -114,15 +116,17 @@ def _verify_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> _Shard
     ]
     ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
     shares = shares_of(columns) if {"hit_speed", "hit_speed_max"} <= columns.keys() else np.empty(0)
-    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, shares)
+    goals = row_keys(columns["goal_q"])[: len(shares)]
+    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, shares, goals)
 
 
 def _slowed_down(blueprint: Blueprint, checks: list[_ShardCheck]) -> list[str]:
     """Say that more hits have the same fraction of their highest speed than luck gives them."""
-    shares = np.concatenate([np.empty(0), *(check.shares for check in checks)])
-    if hit_rule(blueprint.stages).full_speed is None:
+    if hit_rule(blueprint.stages).full_speed is None or not checks:
         return []
-    count, share = repeated_share(shares, blueprint.dtype)
+    shares, goals = (np.concatenate([getattr(check, name) for check in checks]) for name in ("shares", "goals"))
+    _, once = np.unique(goals, return_index=True)  # many starts may have one goal
+    count, share = repeated_share(shares[once], blueprint.dtype)
     same = f"{counted(count, 'hit')} with the same fraction of their highest speed, {share:.6g}"
     return [f"{same}, which is drawn for each: they were slowed down afterwards"] if count else []
 

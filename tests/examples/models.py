@@ -34,6 +34,11 @@ def surroundings_of(name: str) -> Surroundings:
     return Surroundings(record_problem(problem), problem, robot, kernels)
 
 
+def meaning_of(bending_steps: int, landing_steps: int) -> Meaning:
+    """What outputs mean that are bent in so many steps."""
+    return Meaning(path_scale=0.5, bending_steps=bending_steps, landing_steps=landing_steps)
+
+
 def interpreted(given: Surroundings) -> Surroundings:
     """The same with kernels that are interpreted: for a few plans that is quicker than compiling them."""
     return replace(given, kernels=replace(given.kernels, backend="numpy"))
@@ -64,7 +69,7 @@ def architecture_of(given: Surroundings, rows: Rows, settings: TrainingSettings)
 def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
     """A model of a problem with random parameters: plans are bad, but plans."""
     given = surroundings_of(name)
-    kit = make_kit(given, bending_steps=0, landing_steps=0, slow_down=False)  # of which preparing takes nothing else
+    kit = make_kit(given, meaning_of(0, 0), slow_down=False)  # of which preparing takes nothing else
     rows, features = prepare_rows(boundary, kit.prepare)
     architecture = architecture_of(given, rows, SMALL)
     options = {
@@ -81,7 +86,7 @@ def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: 
 def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
     """What one step of training needs, in float32 or float64."""
     given = surroundings_of(name)
-    kit = make_kit(given, bending_steps=settings.bending_steps, landing_steps=settings.landing_steps, slow_down=False)
+    kit = make_kit(given, settings.meaning, slow_down=False)
     rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
     loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
     architecture = architecture_of(given, rows, settings)

@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from cnpgen.cli.main import main
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
+from cnpgen.planner.model_file import shipped_models
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems, plans_of_rows
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.problems.problem import resolved
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine import engine
@@ -134,3 +136,51 @@ def test_the_command_makes_a_certified_dataset(tmp_path: Path, capsys: pytest.Ca
     assert main(["validate", str(out), "--deep"]) == 0
     shutil.rmtree(out)
     assert "0 rows out" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def from_planner(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("planned") / "hits"
+    return make_dataset(
+        "airhockey-hit", out, n=ROWS, certify=True, model="airhockey-hit", workers=1, shard_size=8
+    ).folder
+
+
+def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
+    folder: Path, from_planner: Path
+) -> None:
+    report = validate_dataset(from_planner, deep=True, regenerate=1, workers=1)
+    assert report.ok, report.summary()
+    assert report.to_dict()["plans"] == {"judged": ROWS, "valid": ROWS}
+    stage = open_dataset(from_planner).blueprint.stages[-1]
+    assert (stage["use"], stage["model"], stage["sha256"]) == (
+        "certified-plan", "airhockey-hit", file_sha256(shipped_models()["airhockey-hit"]),
+    )  # fmt: skip
+    one, other = (open_dataset(each).read("train") for each in (folder, from_planner))
+    np.testing.assert_array_equal(one["start_q"], other["start_q"])
+    assert (one["path_control_points"] != other["path_control_points"]).any()
+    np.testing.assert_allclose(one["duration"], other["duration"], rtol=0.03)
+
+
+def test_recipes_without_a_planner_are_written_as_before() -> None:
+    recipe = load_dataset_recipe("airhockey-hit")
+    assert resolved(certified(recipe))["pipeline"]["stage"][-1] == {"use": "certified-plan"}
+
+
+def test_another_model_under_the_name_is_refused(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.h5"
+    shutil.copy(shipped_models()["airhockey-hit"], mine)
+    recipe = certified(load_dataset_recipe("airhockey-hit"), model=mine)
+    shutil.copy(shipped_models()["airhockey-replan"], mine)
+    with pytest.raises(RecipeError, match=r"sha256: the file of model '.*mine\.h5' has"):
+        make_dataset(recipe, tmp_path / "out", n=4, workers=1)
+
+
+def test_a_planner_is_for_certifying(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UsageError, match="certify=True"):
+        make_dataset("airhockey-hit", tmp_path / "out", n=4, model="airhockey-hit")
+    assert main(["make-dataset", "airhockey-hit", "-o", str(tmp_path / "out"), "--model", "airhockey-hit"]) == 2
+    assert "--model says where certifying begins: it needs --certify" in capsys.readouterr().err
+    command = ["make-dataset", "airhockey-hit", "--certify", "--model", "airhockey-hot", "--dry-run"]
+    assert main(command) == 2
+    assert "unknown model 'airhockey-hot'" in capsys.readouterr().err

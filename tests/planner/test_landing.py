@@ -9,7 +9,7 @@ from cnpgen.planner.landing import make_landing
 from cnpgen.planner.preparation import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import anchor_line, assemble
 from tests.conftest import columns_of, needs_compiler
-from tests.examples.models import boundary_of_columns, landing_of, surroundings_of
+from tests.examples.models import boundary_of_columns, landing_of, meaning_of, surroundings_of
 from tests.planner.test_parts import heights, worst_tilt
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
@@ -19,7 +19,7 @@ def nearby(tiny, name: str, count: int = 8) -> tuple[np.ndarray, np.ndarray]:
     """Paths near the manifold, as a network gives them, and heights of obstacles."""
     given = surroundings_of(name)
     boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), count)
-    kit = make_kit(given, bending_steps=1, landing_steps=0, slow_down=False)
+    kit = make_kit(given, meaning_of(1, 0), slow_down=False)
     tasks, spec = kit.prepare(boundary), given.problem.trajectory
     rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
     interior = anchor_line(boundary, rate, spec) + tasks.correction
@@ -91,7 +91,7 @@ def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):
 def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name):
     given = surroundings_of(name)
     boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), 8)
-    kit = make_kit(given, bending_steps=1, landing_steps=1, slow_down=False)
+    kit = make_kit(given, meaning_of(1, 1), slow_down=False)
     tasks, random = kit.prepare(boundary), np.random.default_rng(2)
     phi, log_rate = random.uniform(-1, 1, (8, 10 * given.robot.n)), random.normal(0, 0.3, (8, 20))
     points = control_points(tasks, phi, log_rate, scale=0.1, spec=given.problem.trajectory)
@@ -105,7 +105,7 @@ def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name):
 def test_the_bent_line_is_the_papers_line_bent(tiny):
     given = surroundings_of("heavy-object")
     boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 5)
-    tasks = make_kit(given, bending_steps=1, landing_steps=0, slow_down=False).prepare(boundary)
+    tasks = make_kit(given, meaning_of(1, 0), slow_down=False).prepare(boundary)
     rate, spec = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1), given.problem.trajectory
     line = anchor_line(boundary, rate, spec)
     bent = landing_of("heavy-object").land(assemble(boundary, line, rate, spec), np.zeros((5, 2)))

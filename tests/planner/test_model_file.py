@@ -36,6 +36,18 @@ def test_a_model_comes_back_as_it_was_written(model, tmp_path):
     assert found.problem.comparable_sha256 == model.problem.comparable_sha256
 
 
+def test_a_model_says_which_expected_time_it_means_unless_it_is_the_usual_one(model, tmp_path):
+    save_model(tmp_path / "m.h5", model)
+    said = json.loads(read_sealed(tmp_path / "m.h5", kind="cnpgen-model", version=1).texts["description"])
+    assert "expected_time" not in said["meaning"]
+    reach = replace(model, meaning=replace(model.meaning, expected_time="reach"))
+    save_model(tmp_path / "r.h5", reach)
+    assert load_model(tmp_path / "r.h5").meaning == reach.meaning
+    save_model(tmp_path / "w.h5", replace(model, meaning=replace(model.meaning, expected_time="soon")))
+    with pytest.raises(DatasetError, match="expected_time must be one of distance, reach, got 'soon'"):
+        load_model(tmp_path / "w.h5")
+
+
 def test_equal_models_give_equal_bytes(model, tmp_path):
     for name in ("a.h5", "b.h5"):
         save_model(tmp_path / name, model)

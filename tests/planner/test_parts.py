@@ -21,7 +21,7 @@ from cnpgen.world.state import World
 from tests.conftest import columns_of
 from tests.examples.constraints import TipSpeed
 from tests.examples.jerky import jerky
-from tests.examples.models import boundary_of_columns, interpreted, surroundings_of, untrained_model
+from tests.examples.models import boundary_of_columns, interpreted, meaning_of, surroundings_of, untrained_model
 from tests.examples.plans import KNOTS
 
 LIMITS = ("joint velocity", "joint acceleration", "joint torque")
@@ -43,7 +43,7 @@ def bent_paths(tiny, dataset: str, name: str, steps: int, count: int = 12) -> np
     """Paths of the bent line alone."""
     given = interpreted(surroundings_of(name))
     boundary = boundary_of_columns(columns_of(tiny(dataset)), count)
-    tasks = make_kit(given, bending_steps=steps, landing_steps=0, slow_down=False).prepare(boundary)
+    tasks = make_kit(given, meaning_of(steps, 0), slow_down=False).prepare(boundary)
     spec = given.problem.trajectory
     rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
     interior = anchor_line(boundary, rate, spec)
@@ -91,7 +91,7 @@ def test_a_problem_without_equalities_keeps_the_straight_line(tiny):
     arguments = {"robot": given.robot, "problem": problem}
     kernels = replace(interpreted(given).kernels, identity="free", arguments=arguments)
     surrounding = replace(given, problem=problem, kernels=kernels)
-    kit = make_kit(surrounding, bending_steps=2, landing_steps=1, slow_down=False)
+    kit = make_kit(surrounding, meaning_of(2, 1), slow_down=False)
     assert kit.prepare(boundary_of_columns(columns_of(tiny("heavy-object")), 3)).correction is None
 
 
@@ -101,7 +101,7 @@ def fast(tiny):
     given = surroundings_of("heavy-object")
     boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 12)
     ends = {f"{end}_xyz": columns_of(tiny("heavy-object"))[f"{end}_xyz"][:12] for end in ("start", "goal")}
-    kit = make_kit(given, bending_steps=1, landing_steps=0, slow_down=True)
+    kit = make_kit(given, meaning_of(1, 0), slow_down=True)
     path = bent_paths(tiny, "heavy-object", "heavy-object", 1)
     tasks = kit.prepare(boundary)
     shape = 0.4 + np.sin(np.pi * np.linspace(0, 1, 20))  # slow at the ends

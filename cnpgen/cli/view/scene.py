@@ -14,6 +14,7 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.solid import solids_of
 from cnpgen.world.trace import trace
 
 Array = NDArray[np.float64]
@@ -120,9 +121,11 @@ def _poses(robot: Robot, q: Array) -> Array:
 
 def _world(problem: Problem, tops: Array) -> Iterator[Body]:
     """Draw obstacles, and a table."""
-    for box, top in zip(problem.obstacle, tops.tolist(), strict=True):
-        low, high = (box.x.low, box.y.low, top - (box.height or DEEP)), (box.x.high, box.y.high, top)
-        yield _box(box.name, np.array(low), np.array(high))
+    for obstacle, solid in zip(problem.obstacle, solids_of(problem.obstacle, tops), strict=True):
+        if obstacle.upright and obstacle.height is None:
+            yield _box(obstacle.name, np.array([*solid.low[:2], solid.high[2] - DEEP]), solid.high)
+        else:
+            yield wrapped(obstacle.name, 0, solid.position + solid.corners, solid.radius)
     for each in problem.constraint:
         if isinstance(each, Table):
             low, high = (each.x.low, each.y.low, each.z - THIN), (each.x.high, each.y.high, each.z)

@@ -2,9 +2,10 @@
 
 A hitting configuration is a maximum of ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` among the configurations that put
 the tip at the goal, within the joint limits (reference 2, section on hitting): ``d`` is the direction of the hit, ``J``
-the translational Jacobian of the tip, ``q0`` the base or the start configuration, ``L`` the rated joint velocities.
-There the gradient of f is a combination of the rows of J, but for joints at a limit, which f pushes against it. Which
-of several maxima was found is not looked at. A hitting velocity is the fastest one or a fraction of it, which is drawn.
+the translational Jacobian of the tip, ``q0`` the base, the start or the home configuration, ``L`` the rated joint
+velocities. There the gradient of f is a combination of the rows of J, but for joints at a limit, which f pushes against
+it. Which of several maxima was found is not looked at. A hitting velocity is the fastest one or a fraction of it, which
+is drawn.
 """
 
 import math
@@ -32,7 +33,7 @@ class HitRule:
     """What the stages of a dataset say of its goals.
 
     Attributes:
-        near: The configuration that goals stay close to, "base" or "start"; empty if no stage chooses them.
+        near: The configuration that goals stay close to, "base", "start" or "home"; empty if no stage chooses them.
         full_speed: Fraction of the hits at the highest possible speed; None if no stage chooses the speed.
     """
 
@@ -62,7 +63,8 @@ def judge_goals(
     judged = []
     if rule.near and "hit_angle" in columns:
         q, angle = columns["goal_q"][finite], columns["hit_angle"][finite, 0]
-        home = columns["start_q"][finite] if rule.near == "start" else np.broadcast_to(robot.base, q.shape)
+        near_base = np.broadcast_to(robot.base, q.shape)
+        home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
         error = _slopes(robot, q, home, angle, AT_LIMIT[dtype])
         judged.append(_compared("hitting configuration", "m^2/rad", error, STATIONARY[dtype], finite))
     if rule.full_speed is not None and "hit_speed_max" in columns:

@@ -59,12 +59,23 @@ class HitAngleInCone(Stage):
     The same law as drawing all directions and rejecting those outside the cone, without the rejections.
     """
 
-    needs = ("start_xyz", "goal_xyz")
     half_angle: float = field("half the opening of the cone", unit="rad", low=0.0, high=np.pi)
+    origin: str = field(
+        'where the line to the goal begins: at the "start", or at the "home" that a stage before chose',
+        choices=("start", "home"),
+        default="start",
+        late=True,
+    )
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Both ends of the line."""
+        return f"{self.origin}_xyz", "goal_xyz"
 
     def describe(self) -> str:
         """Say how wide."""
-        return f"draw the hit direction uniformly within {self.half_angle:.4g} rad of the line from start to goal"
+        line = f"the line from {self.origin} to goal"
+        return f"draw the hit direction uniformly within {self.half_angle:.4g} rad of {line}"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The angle."""
@@ -76,7 +87,7 @@ class HitAngleInCone(Stage):
         del context
 
         def work(draws: Round, random: np.random.Generator) -> None:
-            x, y = (draws["goal_xyz"] - draws["start_xyz"])[:2]
+            x, y = (draws["goal_xyz"] - draws[f"{self.origin}_xyz"])[:2]
             noise = self.half_angle * (2 * draws.draw(random, 1) - 1)
             draws["hit_angle"] = wrap(np.arctan2(y, x) + noise)
 

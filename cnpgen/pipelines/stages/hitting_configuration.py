@@ -23,17 +23,22 @@ from cnpgen.store.field import Field
 
 @dataclass(frozen=True, kw_only=True)
 class HittingConfiguration(Stage):
-    """Joint positions of the goal with maximal manipulability along the hit, close to the start or to the base."""
+    """Joint positions of the goal with maximal manipulability along the hit, close to start, base or home."""
 
-    needs = ("goal_xyz", "hit_angle")
-    near: str = field("the configuration that the search starts from and stays close to", choices=("base", "start"))
+    near: str = field(
+        "the configuration that the search starts from and stays close to", choices=("base", "start", "home")
+    )
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The hit, and the home where goals are near it."""
+        return ("goal_xyz", "hit_angle", "home_q") if self.near == "home" else ("goal_xyz", "hit_angle")
 
     def describe(self) -> str:
         """Say near what."""
-        where = "the base" if self.near == "base" else "the start"
         return (
             "find the goal configuration within the joint limits from which the tip moves fastest along the hit, near"
-            f" {where} configuration"
+            f" the {self.near} configuration"
         )
 
     def provides(self, context: Context) -> tuple[Field, ...]:
@@ -49,7 +54,7 @@ class HittingConfiguration(Stage):
 
         def work(draws: Round, _random: np.random.Generator) -> None:
             n = len(draws.alive)
-            home = draws["start_q"] if self.near == "start" else np.repeat(robot.base[:, None], n, axis=1)
+            home = np.repeat(robot.base[:, None], n, axis=1) if self.near == "base" else draws[f"{self.near}_q"]
             direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
             draws["goal_q"], solved, value = search.solve(draws["goal_xyz"], direction, home)
             draws.reject(solved, "no hitting configuration")

@@ -55,16 +55,39 @@ class _IK(Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StartIK(_IK):
+class GuessedIK(_IK):
+    """From a random guess, or from the base configuration."""
+
+    guess: tuple[Range, ...] = field("box of random guesses; none: the base configuration", unit="rad", default=())
+
+    def _origin(self) -> str:
+        """Say from where."""
+        box = " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess)
+        return f"a random guess in {box} rad" if self.guess else "the base configuration"
+
+    def _solve_guessed(self, context: Context, end: str) -> Work:
+        n = context.robot.n
+        if self.guess and len(self.guess) != n:
+            raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
+        guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
+        solve = self._solve(context, end, "guess_q")
+
+        def work(draws: Round, random: np.random.Generator) -> None:
+            draws["guess_q"] = uniform(draws.draw(random, n), guess)
+            solve(draws, random)
+
+        return work
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartIK(GuessedIK):
     """Joint positions of the start, from the base configuration or from a random guess."""
 
     needs = ("start_xyz",)
-    guess: tuple[Range, ...] = field("box of random guesses; none: the base configuration", unit="rad", default=())
 
     def describe(self) -> str:
         """Say from where."""
-        origin = "a random guess in " + " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess) + " rad"
-        return f"solve the start configuration{self._how()} from {origin if self.guess else 'the base configuration'}"
+        return f"solve the start configuration{self._how()} from {self._origin()}"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The start configuration."""
@@ -72,17 +95,7 @@ class StartIK(_IK):
 
     def prepare(self, context: Context) -> Work:
         """Load the kernel."""
-        n = context.robot.n
-        if self.guess and len(self.guess) != n:
-            raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
-        guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
-        solve_start = self._solve(context, "start", "guess_q")
-
-        def work(draws: Round, random: np.random.Generator) -> None:
-            draws["guess_q"] = uniform(draws.draw(random, n), guess)
-            solve_start(draws, random)
-
-        return work
+        return self._solve_guessed(context, "start")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,12 +11,14 @@ from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, add, dot, scale
+from cnpgen.symbolic.linalg import Scalar, add, dot, scale, subtract
 from cnpgen.symbolic.state import Vec, bias_acceleration, forward_kinematics, inverse_dynamics, symbols, tip_velocity
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
+NEWTON_STEPS = 3  # from a millimetre to rounding
+OVER = 1.005  # of velocity limits: what plans may be above them
 STILL = 1e-9  # rad/s and rad/s^2: what rounding leaves of a velocity or an acceleration that was zero
 
 
@@ -171,6 +173,32 @@ def velocity_of_tip(robot: "Robot") -> Any:
     return ca.Function("velocity_of_tip", [q_sx, dq_sx], [ca.vertcat(*velocity)])
 
 
+def onto_table(robot: "Robot", *, height: float) -> Any:
+    """Build ``(q, dq, ddq) -> (q, dq, ddq)``: the nearest state whose tip is, moves and accelerates on the table.
+
+    For states that are off it by what plans are off: three Newton steps for q, then two projections. Velocities that
+    are above their limits by as little are slowed down to them.
+
+    Args:
+        robot: The robot.
+        height: Height of the table [m].
+    """
+    import casadi as ca
+
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq) = (symbols(name, robot.n) for name in ("q", "dq", "ddq"))
+    limit = [float(x) for x in robot.velocity_limit]
+    for _ in range(NEWTON_STEPS):
+        kin = forward_kinematics(robot.chain, q)
+        q = _project(q, [c[2] for c in kin.jacobian], limit, rest=kin.tip[2] - height, at=q)
+    kin = forward_kinematics(robot.chain, q)
+    row = [c[2] for c in kin.jacobian]
+    dq = _project(dq, row, limit)
+    over = ca.mmax(ca.vertcat(*[ca.fabs(x) / bound for x, bound in zip(dq, limit, strict=True)]))
+    dq = scale(dq, 1.0 / ca.if_else(over <= OVER, ca.fmax(over, 1.0), 1.0))
+    ddq = _project(ddq, row, [float(x) for x in robot.acceleration_limit], rest=bias_acceleration(kin, dq)[2])
+    return ca.Function("onto_table", [q_sx, dq_sx, ddq_sx], [ca.vertcat(*each) for each in (q, dq, ddq)])
+
+
 def table_velocity(robot: "Robot") -> Any:
     """Build ``(q, direction, length) -> (dq, tip velocity)`` with ``J_z dq = 0``.
 
@@ -229,10 +257,10 @@ def table_acceleration(robot: "Robot") -> Any:
     return ca.Function("table_acceleration", [q_sx, dq_sx, u_sx, s_sx], [ca.vertcat(*ddq), room])
 
 
-def _project(x: Vec, row: Vec, weight: list[float]) -> Vec:
-    """Project x on ``{row . x = 0}`` in the metric ``diag(weight)^-2``."""
+def _project(x: Vec, row: Vec, weight: list[float], *, rest: Scalar = 0.0, at: Vec | None = None) -> Vec:
+    """Project x on ``{row . (x - at) + rest = 0}`` in the metric ``diag(weight)^-2``; ``at`` is zero by default."""
     spread = [bound * bound * r for bound, r in zip(weight, row, strict=True)]
-    miss = dot(row, x) / dot(row, spread)
+    miss = (dot(row, x if at is None else subtract(x, at)) + rest) / dot(row, spread)
     return [value - s * miss for value, s in zip(x, spread, strict=True)]
 
 

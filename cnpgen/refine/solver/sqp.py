@@ -31,6 +31,7 @@ LEAP = 1.5  # the next step may be longer than the last one by this factor
 NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the first, residuals this near are held
 LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
+HEAVY = 3.0  # times the objective is what violations weigh where repairing them would not pay
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
 NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; share of the promised gain
 LAST_STEPS = 3  # before a deadline land
@@ -47,7 +48,8 @@ class Settings:
         max_iterations: Largest number of steps tried.
         radius: First trust radius, infinity norm [rad and log].
         proximal: Weight of the proximal term.
-        penalty: Weight of the worst violation in the merit function.
+        penalty: First weight of the worst violation in the merit function. To slow down by 1 % costs 1 % of the motion
+            time, so that a motion of more seconds than this gains by breaking its limits; where that holds it grows.
         funnel: First width of the funnel, a violation.
         far: A start that violates more is none.
         cost_tolerance: Relative change of the objective, promised and reached, below which it has settled.
@@ -138,7 +140,7 @@ class _Descent:
         self._motion, self._bounds, self._settings = motion, bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
-        self._radius, self._funnel = settings.radius, settings.funnel
+        self._radius, self._funnel, self._penalty = settings.radius, settings.funnel, settings.penalty
         self._length = LARGEST  # of the last step, in the same norm
         self._multipliers: Array | None = None
         self._settled = False
@@ -154,7 +156,7 @@ class _Descent:
         held = self._held(at)
         settings = self._settings
         proximal = SHORTEST if self.landing else LANDING if self._settled else settings.proximal
-        model = QuadraticModel(self._motion, at, self._bounds, self.violation, proximal, settings.penalty)
+        model = QuadraticModel(self._motion, at, self._bounds, self.violation, proximal, self._penalty)
         step = self._propose(model, held)
         if step is None:
             self._radius *= 0.25
@@ -181,7 +183,10 @@ class _Descent:
         box = self._radius * self._scale
         step = model.solve(held, box, warm=self._multipliers)
         if self.violation > self._settings.violation_tolerance and (step is None or step.left > STUCK):
-            return model.solve(held, box, relax=True) or step
+            relaxed = model.solve(held, box, relax=True)
+            if relaxed is not None and relaxed.left > STUCK and self._penalty < self.cost:
+                self._penalty = HEAVY * self.cost
+            return relaxed or step
         if step is None and self._multipliers is not None:
             return model.solve(held, box)
         return step
@@ -193,8 +198,8 @@ class _Descent:
         cost, g = self._motion.value(x)
         violation = self._bounds.violation(g)
         gain = -model.cost(step.dx)
-        predicted = gain + settings.penalty * self.violation * (1 - step.left)
-        reduction = self.cost - cost + settings.penalty * (self.violation - violation)
+        predicted = gain + self._penalty * self.violation * (1 - step.left)
+        reduction = self.cost - cost + self._penalty * (self.violation - violation)
         cheaper = violation <= self._funnel and self.cost - cost > WORTH * gain > 0
         size = float(np.abs(step.dx / self._scale).max())
         self._multipliers = step.multipliers

@@ -1,0 +1,177 @@
+"""Planning on the fly: fresh problems that start on motions which are being executed, set by set.
+
+First motions are valid plans of the shipped planners for hits and replans; new problems start on them at a moment
+between 0.05 and 0.95 of their time T, where they are, off the table by what plans are:
+
+* "new puck": to a new puck, anywhere on the table, in a direction within 120 degrees of the way to it, at full speed in
+  a fifth of the cases; the goal configuration is chosen close to where the arm is;
+* "same goal": to the goal of the motion;
+* "near the base": to goals of the dataset airhockey-hit at full speed, chosen close to the base configuration;
+* "another problem's": to goals of the dataset airhockey-replan, chosen close to other starts;
+* "on refined plans": as "new puck", from motions that were refined before they were executed;
+* "today's rows": rows of the dataset airhockey-replan.
+
+Nothing was chosen by these seeds. The clock is CPU time, one BLAS thread. Goals stand beside the figures.
+
+    python benchmarks/onthefly.py
+    python benchmarks/onthefly.py --full     # 1,000 problems of each set, all refined
+"""
+
+import argparse
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from common import arguments, median, progress, report, table, verdict
+from refiner_problems import make_each
+
+from cnpgen.machine.threads import one_thread
+from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.complete import complete
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
+from cnpgen.planner.planner import Planner, states_at
+from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.record import ProblemRecord
+from cnpgen.refine.options import DEFAULT
+from cnpgen.refine.plans import refine_plans
+from cnpgen.trajectory.boundary import Boundary
+
+FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the first motions
+MOMENTS = (0.05, 0.95)  # of T
+MOMENTS_REFINED = 4  # on every refined motion
+SPARE = 1.25  # problems drawn for each that is wanted: some first motions are not valid, some tasks have no answer
+FULL_SPEED = 0.2
+CONE = np.deg2rad(120)
+TABLE = np.array([[0.6, 1.3], [-0.45, 0.45]])  # m
+GOALS = {  # share of valid plans, as the network gives them
+    "new puck": 0.97, "same goal": 0.96, "near the base": 0.95, "another problem's": 0.95, "on refined plans": 0.95,
+    "today's rows": 0.96,
+}  # fmt: skip
+REFINED_VALID, OVER_REFINED, REFINE_MS, REFINE_P95_MS = 0.998, 1.08, 8.0, 15.0
+COUNT, SHORT = (1000, 1000), (300, 60)  # problems of a set, and how many of them are refined
+
+State = tuple[Any, Any, Any]
+
+
+def first_motions(count: int, seed: int) -> Plans:
+    """Valid plans of the shipped planners, half for replans and half for hits."""
+    parts = []
+    for name in FIRST:
+        plans = Planner(name).plan_batch(draw_boundary_problems(name, int(SPARE * count / 2), seed=seed).boundary)
+        parts.append(plans[evaluate_plans(plans).valid][: count // 2])
+    return concatenate(parts)
+
+
+def states_of(plans: Plans, random: np.random.Generator) -> State:
+    """One random moment of every plan."""
+    return states_at(plans, random.uniform(*MOMENTS, len(plans)) * plans.duration)
+
+
+def to_new_pucks(state: State, problem: ProblemRecord, random: np.random.Generator) -> Boundary:
+    """Problems from states to pucks anywhere, those that have an answer."""
+    q, dq, ddq = state
+    count = len(q)
+    goal = random.uniform(TABLE[:, 0], TABLE[:, 1], (count, 2))
+    x, y = (goal - problem.tip_positions(q)[:, :2]).T
+    asked = {"start_q": q, "start_dq": dq, "start_ddq": ddq, "goal_xyz": goal}
+    asked["hit_angle"] = np.arctan2(y, x) + random.uniform(-CONE, CONE, count)
+    share = np.where(random.uniform(size=count) < FULL_SPEED, 1.0, random.uniform(1e-3, 1.0, count))
+    return complete("airhockey-replan", **asked, hit_speed_share=share).plans.boundary
+
+
+def to_goals(state: State, goals: Boundary) -> Boundary:
+    """Problems from states to the goals of others."""
+    q, dq, ddq = state
+    return Boundary(q, dq, ddq, goals.goal_q[: len(q)], goals.goal_dq[: len(q)])
+
+
+def full_speed_hits(count: int, seed: int) -> Boundary:
+    """Hits of the dataset airhockey-hit, all of them at full speed."""
+    recipe = load_dataset_recipe("airhockey-hit")
+    stages = (
+        replace(each, full_speed=1.0) if isinstance(each, HittingVelocity) else each for each in recipe.pipeline.stage
+    )
+    fast = replace(recipe, pipeline=replace(recipe.pipeline, stage=tuple(stages)))
+    return draw_boundary_problems(fast, count, seed=seed).boundary
+
+
+def sets(count: int, seed: int) -> dict[str, Boundary]:
+    """Make the six sets."""
+    random, drawn = np.random.default_rng(seed), int(SPARE * count)
+    progress(f"{drawn} first motions")
+    plans = first_motions(drawn, seed)
+    others = draw_boundary_problems("airhockey-replan", drawn, seed=seed + 1).boundary
+    progress(f"{drawn // MOMENTS_REFINED} first motions refined")
+    refined = refine_plans(plans[::MOMENTS_REFINED])
+    executed = refined.plans[np.repeat(np.flatnonzero(refined.valid), MOMENTS_REFINED)]
+    found = {
+        "new puck": to_new_pucks(states_of(plans, random), plans.problem, random),
+        "same goal": to_goals(states_of(plans, random), plans.boundary),
+        "near the base": to_goals(states_of(plans, random), full_speed_hits(drawn, seed + 2)),
+        "another problem's": to_goals(states_of(plans, random), others),
+        "on refined plans": to_new_pucks(states_of(executed, random), plans.problem, random),
+        "today's rows": draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary,
+    }
+    return {name: boundary[random.permutation(len(boundary))[:count]] for name, boundary in found.items()}
+
+
+def measure(planner: Planner, boundary: Boundary, refined: int) -> dict[str, float]:
+    """Plan, judge, refine some."""
+    plans = planner.plan_batch(boundary)
+    found = {"problems": len(plans), "valid alone": float(evaluate_plans(plans).valid.mean())}
+    some = plans[:refined]
+    with one_thread():
+        made = make_each(some, DEFAULT)
+    good = np.array([each.valid for each in made])
+    after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
+    return found | {
+        "valid refined": float(good.mean()),
+        "T / refined": float(some.duration[good].mean() / after[good].mean()),
+        "refine, median ms": median(ms),
+        "refine, p95 ms": float(np.quantile(ms, 0.95)),
+    }
+
+
+def rows_of(model: str, name: str, found: dict[str, float]) -> list[tuple[str, ...]]:
+    """Lay out what was found of a set, each figure beside its goal."""
+    goals = {
+        "valid alone": (GOALS[name], False), "valid refined": (REFINED_VALID, False),
+        "T / refined": (OVER_REFINED, True), "refine, median ms": (REFINE_MS, True),
+        "refine, p95 ms": (REFINE_P95_MS, True),
+    }  # fmt: skip
+    rows = []
+    for what, value in found.items():
+        goal, at_most = goals.get(what, (None, False))
+        rows.append((model, name, what, f"{value:,.4g}", *verdict(value, goal, at_most=at_most)))
+    return rows
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument("--models", nargs="+", default=["airhockey-onthefly"], help="shipped ones or files")
+    parser.add_argument("--full", action="store_true", help="1,000 problems of each set, all of them refined")
+    parser.add_argument("--seed", type=int, default=135_792_468, help="of the problems")
+
+
+def main() -> None:
+    """Run."""
+    chosen = arguments(__doc__, options)
+    count, refined = COUNT if chosen.full else SHORT
+    problems = sets(count, chosen.seed)
+    results: dict[str, Any] = {}
+    for model in chosen.models:
+        planner = Planner(model)
+        for name, boundary in problems.items():
+            progress(f"{model}: {name}")
+            results.setdefault(model, {})[name] = measure(planner, boundary, refined)
+    each = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
+    rows = [row for model, name, found in each for row in rows_of(model, name, found)]
+    head = ("planner", "problems", "figure", "value", "goal", "")
+    report({"onthefly": results}, [table("planning on the fly", head, rows, left=3)], as_json=chosen.json)
+
+
+if __name__ == "__main__":
+    main()

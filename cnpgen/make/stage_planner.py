@@ -1,0 +1,52 @@
+"""The planner that a stage plans with: rows depend on its numbers, so that recipes say which file it must be."""
+
+from typing import TYPE_CHECKING
+
+from cnpgen.errors import RecipeError
+from cnpgen.pipelines.context import Context
+from cnpgen.problems.record import record_problem
+
+if TYPE_CHECKING:
+    from cnpgen.planner.planner import Planner
+
+SHA256 = "^([0-9a-f]{64})?$"
+
+
+def model_sha256(model: str) -> str:
+    """Return the sha256 of the file of a model, by the name of a shipped one or the file's path.
+
+    Raises:
+        UsageError: There is no such model.
+    """
+    from cnpgen.planner.model_file import find_model
+    from cnpgen.store.files.atomic import file_sha256
+    from cnpgen.store.paths import require_file
+
+    path = find_model(model)
+    require_file(path, "a model")
+    return file_sha256(path)
+
+
+def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
+    """Load the planner of a stage.
+
+    Args:
+        model: Name of a shipped model, or path of a model file.
+        sha256: Digest of its file.
+        context: Problem and kernels of the stage.
+
+    Raises:
+        RecipeError: It is another one, or for another problem.
+        UsageError: There is no such model.
+    """
+    from cnpgen.planner.model_file import load_model
+    from cnpgen.planner.planner import Planner
+
+    found = model_sha256(model)
+    if found != sha256:
+        raise RecipeError([f"sha256: the file of model {model!r} has {found}, expected {sha256}"])
+    loaded, problem = load_model(model), record_problem(context.problem)
+    if loaded.problem.comparable_sha256 != problem.comparable_sha256:
+        differs = ", ".join(problem.differences(loaded.problem)[:4])
+        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}"])
+    return Planner(loaded, backend=context.kernels.backend)

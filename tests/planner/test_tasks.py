@@ -1,0 +1,54 @@
+"""Expected times: that of the distance, and the least time of joints with bounded velocity and acceleration."""
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from cnpgen.planner.tasks import SHORTEST_REACH, reaching_time
+from cnpgen.trajectory.boundary import Boundary
+
+STEPS = 80
+
+
+def one_joint(q0: float, v0: float, q1: float, v1: float, *, velocity: float, acceleration: float) -> float:
+    state = [np.array([[value]]) for value in (q0, v0, 0.0, q1, v1)]
+    return float(reaching_time(Boundary(*state), np.array([velocity]), np.array([acceleration]))[0])
+
+
+def can_reach(time: float, q0: float, v0: float, q1: float, v1: float, velocity: float, acceleration: float) -> bool:
+    """Whether piecewise constant accelerations get there in a time: a linear programme."""
+    dt = time / STEPS
+    speeds = dt * np.tril(np.ones((STEPS, STEPS)))  # after every step
+    way = dt**2 * (STEPS - 0.5 - np.arange(STEPS))
+    equal, right = np.stack([speeds[-1], way]), [v1 - v0, q1 - q0 - v0 * time]
+    unequal = np.concatenate([speeds, -speeds])
+    bound = np.concatenate([np.full(STEPS, velocity - v0), np.full(STEPS, velocity + v0)])
+    found = linprog(
+        np.zeros(STEPS), A_ub=unequal, b_ub=bound, A_eq=equal, b_eq=right, bounds=(-acceleration, acceleration)
+    )
+    return bool(found.status == 0)
+
+
+def test_no_joint_gets_there_sooner_and_every_one_can_get_there_then() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(12):
+        velocity, acceleration = random.uniform(0.5, 2.0), random.uniform(5.0, 20.0)
+        v0, v1 = random.uniform(-velocity, velocity, 2)
+        q1 = random.uniform(-0.6, 0.6) * random.choice([0.1, 1.0])
+        found = one_joint(0.0, v0, q1, v1, velocity=velocity, acceleration=acceleration)
+        if found > 1.1 * SHORTEST_REACH:
+            assert not can_reach(0.97 * found, 0.0, v0, q1, v1, velocity, acceleration)
+            assert can_reach(1.03 * found, 0.0, v0, q1, v1, velocity, acceleration)
+
+
+def test_the_slowest_joint_counts_and_no_time_is_shorter_than_the_floor() -> None:
+    zero = np.zeros((1, 2))
+    far = Boundary(zero, zero, zero, np.array([[0.1, 1.0]]), zero)
+    limits = np.array([1.0, 1.0]), np.array([10.0, 10.0])
+    assert reaching_time(far, *limits)[0] == pytest.approx(1.0 / 1.0 + 1.0 / 10.0)  # cruising, and both ramps
+    assert reaching_time(Boundary(zero, zero, zero, zero, zero), *limits)[0] == SHORTEST_REACH
+
+
+def test_who_moves_the_wrong_way_takes_longer() -> None:
+    towards, away = (one_joint(0, v, 0.3, 0.0, velocity=1.0, acceleration=10.0) for v in (0.8, -0.8))
+    assert away == pytest.approx(towards + 2 * 0.8 / 10.0)  # back to where it was, now the right way
