@@ -1,5 +1,6 @@
 """Problems from files, by name or path, and from what was written down of them."""
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,11 +11,13 @@ from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes
 from cnpgen.problems.problem import FILES, Problem
+from cnpgen.robots.shape.inline import mesh_files
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind, read_table
+from cnpgen.schema.units import show
 
 
 def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
@@ -110,13 +113,21 @@ def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem
 
 
 def restoring_reader(urdf: str, path: Path) -> Reader:
-    """Return what reads a resolved problem, its defaults left out, as if it stood in ``path``; write its URDF there."""
+    """Return what reads a resolved problem, its defaults left out, as if it stood in ``path``; write its URDF there.
+
+    It may come from a stranger: what it needs is in its text, and no other file is read.
+    """
     (path.parent / "robot.urdf").write_text(urdf, encoding="utf-8")
 
     def read(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
         if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
             raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
         robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
+        with suppress(ValueError):  # whoever loads the robot says so
+            if robot.get("geometry") == "urdf" and (names := mesh_files(urdf)):
+                text = f"names the mesh {show(names[0])}, expected its corners in the text"
+                mistakes.append((where / "robot" / "urdf").says(text))
+                return None
         value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
         readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)

@@ -6,6 +6,8 @@ from pathlib import Path
 from urllib.parse import unquote, urlparse
 
 from cnpgen.errors import RecipeError
+from cnpgen.schema.catalogue import LONGEST
+from cnpgen.schema.units import show
 
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
@@ -27,10 +29,13 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
         RecipeError: It is in none of these places; with every one of them.
     """
     places = list(dict.fromkeys(_places(name, urdf.absolute(), packages)))
-    found = next((place for place in places if place.is_file()), None)
+    found = next((place for place in places if os.path.isfile(place)), None)  # noqa: PTH113 - takes names of any length
     if found is None:
-        said = "\n".join(f"  {place}" for place in places) or "  nowhere: a file of this kind of address is not read"
-        raise RecipeError([f"{urdf}: the file {name!r} is missing; looked for at\n{said}{_hint(name)}"])
+        said = (
+            "\n".join(f"  {str(place)[:LONGEST]}" for place in places)
+            or "  nowhere: a file of this kind of address is not read"
+        )
+        raise RecipeError([f"{urdf}: the file {show(name)} is missing; looked for at\n{said}{_hint(name)}"])
     return found
 
 
