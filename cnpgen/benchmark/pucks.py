@@ -1,5 +1,6 @@
 """Pucks on a grid, and the boundary problems of hitting each of them towards the goal."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.behind_puck import behind
-from cnpgen.pipelines.stages.given_positions import GivenPositions
+from cnpgen.pipelines.stages.given_positions import MOST_TASKS, GivenPositions
 from cnpgen.pipelines.stages.hit_angle import HitAngleToGoal
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
@@ -37,6 +38,11 @@ class Pucks:
     rows: int = field("how many rows of pucks, evenly spaced along y", low=1)
     goal: tuple[float, float] = field("where they are sent: x, y", unit="m")
     behind: float = field("where the tip is when it hits: so far behind the puck's centre", unit="m", low=0.0)
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        if (count := self.columns * self.rows) > MOST_TASKS:
+            yield "columns", f"a grid of {count:,} pucks is too large, expected at most {MOST_TASKS:,}"
 
     def positions(self) -> Array:
         """Place the pucks [m], shape (2, columns x rows), y fastest."""

@@ -14,13 +14,28 @@ from typing import Any
 import numpy as np
 
 from cnpgen.benchmark.planner import Answer
+from cnpgen.benchmark.statistics import FIGURES
 from cnpgen.benchmark.trajectory import Trajectory
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.store.files.atomic import machine_error, write_file
+from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Form, Maybe, check_form
+from cnpgen.store.paths import require_file
 
 FORMAT = "cnpgen-benchmark"
 FORMAT_VERSION = 1
+_POINTS = [Maybe(NUMBER)]
+_PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
+_NEEDED = {"t": _POINTS, "q": [_POINTS]}
+_SAMPLES = {**_NEEDED, "dq": [_POINTS], "ddq": [_POINTS]}
+_PLANNED = {"ending": TEXT, "planning_s": NUMBER, "planning_cpu_s": NUMBER, "error": TEXT}
+_VERDICT = {
+    "valid": ANYTHING,
+    "paper": {"valid": ANYTHING, "finished": ANYTHING},
+    "metrics": {EVERY: Maybe(NUMBER)},
+    "value_over_bound": {EVERY: NUMBER},
+}
 
 
 @dataclass
@@ -80,12 +95,14 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
 
     Raises:
         UsageError: The file is of another run.
+        DatasetError: It holds something else.
         MachineError: It cannot be read or written.
     """
     head = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **identity})
     results = Results(path)
     lines: list[str] = []
     if path.exists():
+        require_file(path, "the results of a planner")
         lines = _whole_lines(path)
         if lines and lines[0] != head and not discard:
             raise UsageError(
@@ -93,10 +110,36 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
                 " away, another folder keeps them"
             )
         lines = lines[1:] if lines and lines[0] == head else []
+    for number, line in enumerate(lines, start=2):
+        row = json.loads(line)
+        try:
+            _check_row(row)
+        except ValueError as error:
+            raise DatasetError(f"{path} is damaged: line {number}: {error}; delete that line") from error
+        results._take(row)
     write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
-    for line in lines:
-        results._take(json.loads(line))
     return results
+
+
+def _check_row(row: Any) -> None:
+    """Refuse with a ``ValueError`` what is no line of results; they may come from other people."""
+    check_form(row, {"problem": WHOLE})
+    if "ending" in row:
+        check_form(row, {**_PLANNED, "answer": Maybe({EVERY: ANYTHING})})
+        if answer := row["answer"]:
+            form = _PLAN if "degree" in answer else {**_NEEDED, **_present(_SAMPLES, answer)}
+            check_form(answer, form)
+            check_form(row, {"verdict": _VERDICT})
+            for name in form.keys() - {"degree"}:
+                np.array(answer[name], float)  # of rows of one length
+    if "executed" in row:
+        check_form(row, {"executed": {EVERY: {EVERY: ANYTHING}}})
+        for executed in row["executed"].values():
+            check_form(executed, _present(dict.fromkeys(FIGURES, Maybe(NUMBER)), executed))
+
+
+def _present(forms: dict[str, Form], table: dict[str, Any]) -> dict[str, Form]:
+    return {name: form for name, form in forms.items() if name in table}
 
 
 def _whole_lines(path: Path) -> list[str]:
@@ -108,7 +151,7 @@ def _whole_lines(path: Path) -> list[str]:
         raise machine_error("read", path, error) from error
     for line in lines:
         try:
-            json.loads(line)
+            parse_json(line)
         except ValueError:
             break
         found.append(line)
@@ -130,7 +173,8 @@ def answer_to_dict(answer: Answer) -> dict[str, Any] | None:
 
 def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Trajectory:
     """Read an answer for one boundary problem back."""
-    numbers = {name: np.array(values, float) for name, values in content.items() if name != "degree"}
+    known = _PLAN.keys() - {"degree"} if "degree" in content else _SAMPLES.keys() & content.keys()
+    numbers = {name: np.array(content[name], float) for name in known}
     if "degree" not in content:
         return Trajectory(**numbers)
     return make_plans(

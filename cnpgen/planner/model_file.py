@@ -16,6 +16,7 @@ from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.features import BLOCKS, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.documents import parse_json
@@ -138,6 +139,8 @@ def _assembled(content: Content) -> Model:
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
     meaning = Meaning(**description["meaning"])
     _check_sizes(problem, architecture, features)
+    if unknown := set(description["rest"]) - set(BOUNDARY):
+        raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
     if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
         raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
     if meaning.expected_time not in EXPECTED_TIMES:

@@ -39,7 +39,8 @@ def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterat
         return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
-        yield (where / "urdf").says(f"no such file: {path}{hint}")
+        there = os.path.exists(path)  # noqa: PTH110 - likewise
+        yield (where / "urdf").says(f"not a file: {path}" if there else f"no such file: {path}{hint}")
         return
     try:
         tree = urdf_tree(read_urdf(path))

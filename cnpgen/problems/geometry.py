@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 from cnpgen.errors import RecipeError
 from cnpgen.problems.checks import named_packages, tables
 from cnpgen.robots.shape.files import find_named_file, find_urdf
+from cnpgen.robots.shape.inline import mesh_files
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
 
@@ -70,10 +71,10 @@ def _missing_files(
     for package in packages:
         if not package.is_dir():
             yield (where / "packages").says(f"no such folder: {package}")
-    meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
-    for name in meshes:
+    urdf = find_urdf(str(robot.get("urdf")), folder / "problem.toml", packages) if elements else folder
+    for name in mesh_files(read_urdf(urdf)) if elements else ():
         try:
-            find_named_file(name, find_urdf(str(robot["urdf"]), folder / "problem.toml", packages), packages)
+            find_named_file(name, urdf, packages)
         except RecipeError as error:
             yield (where / "urdf").says(str(error))
     srdf = robot.get("srdf")

@@ -1,5 +1,7 @@
 """Problems from files, by name or path, and from what was written down of them."""
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,12 +16,13 @@ from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.files import find_named_file
-from cnpgen.robots.shape.inline import inline_mesh, is_inline
+from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind, read_table
+from cnpgen.schema.units import show
 
 
 def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
@@ -132,7 +135,10 @@ def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem
 
 
 def restoring_reader(urdf: str, path: Path) -> Reader:
-    """Return what reads a resolved problem, its defaults left out, as if it stood in ``path``; write its URDF there."""
+    """Return what reads a resolved problem, its defaults left out, as if it stood in ``path``; write its URDF there.
+
+    It may come from a stranger: what it needs is in its text, and no other file is read.
+    """
     (path.parent / "robot.urdf").write_text(urdf, encoding="utf-8")
 
     def read(value: Any, where: Place, mistakes: list[str]) -> Problem | None:
@@ -142,9 +148,23 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
         value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
         readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
         made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
-        return made and replace(made, path=path)
+        if made is None or (named := list(_meshes_on_disk(made, urdf, where))):
+            mistakes.extend(() if made is None else named)
+            return None
+        return replace(made, path=path)
 
     return read
+
+
+def _meshes_on_disk(problem: Problem, urdf: str, where: Place) -> Iterator[str]:
+    """Say which meshes a problem only names."""
+    text = "names the mesh {}, expected its corners in the text"
+    with suppress(ValueError):  # whoever loads the robot says so
+        for name in mesh_files(urdf)[:1] if problem.robot.geometry == "urdf" else ():
+            yield (where / "robot" / "urdf").says(text.format(show(name)))
+    for index, each in enumerate(problem.obstacle):
+        if each.mesh and not is_inline(each.mesh):
+            yield (where / "obstacle" / index / "mesh").says(text.format(show(each.mesh)))
 
 
 def missing_kinds(group: str, entries: list[tuple[int, dict[str, Any]]]) -> list[str]:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from cnpgen.robots.shape.hull import check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.schema.keys import Range, field
 
@@ -108,7 +109,7 @@ class Obstacle:
             yield "scale", f"factors must not be 0, got {list(self.scale)}"
         if is_inline(self.mesh):
             try:
-                corners_of(self.mesh)
+                check_solid(corners_of(self.mesh))
             except ValueError as error:
                 yield "mesh", str(error)
 

@@ -305,7 +305,9 @@ def from_json(content: Mapping[str, Any]) -> Blueprint:
         arguments["seed"] = int(content["seed"])
         arguments["fields"] = tuple(_field(item) for item in content["fields"])
         return Blueprint(**arguments)
-    except (KeyError, TypeError, ValueError, AttributeError, UsageError) as error:
+    except UsageError as error:
+        raise DatasetError(f"plan.json is damaged: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DatasetError(f"plan.json is damaged: {type(error).__name__} {error}") from error
 
 

@@ -1,7 +1,10 @@
 """Runs that are resumed, and planners that crash, hang or return garbage: each costs its own row."""
 
 import json
+import os
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +13,7 @@ from cnpgen.benchmark.results import answer_from_dict, answer_to_dict, open_resu
 from cnpgen.benchmark.run import run_benchmark
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.schema import registry
 
 BAD = """
@@ -139,6 +142,43 @@ def test_results_of_another_run_are_not_mixed_in(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "cnp-b.jsonl").read_text().splitlines()[0])["suite"] == "hits-110"
 
 
+PLANNED = {"problem": 0, "ending": "planned", "planning_s": 1.0, "planning_cpu_s": 1.0, "error": "", "answer": None}
+ANSWER = {"degree": 7, "path_control_points": [[0.0]], "rate_control_points": [1.0]}
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        ([], "the document must be a table, got a list of 0"),
+        ({}, "problem is missing"),
+        ({"problem": "0"}, "problem must be a whole number"),
+        ({"problem": 0, "ending": "planned"}, "planning_s is missing"),
+        ({**PLANNED, "planning_s": "x"}, "planning_s must be a number, got 'x'"),
+        ({**PLANNED, "answer": {"t": [0.0]}}, "q is missing"),
+        ({**PLANNED, "answer": {**ANSWER, "rate_control_points": "x"}}, "rate_control_points must be a list, got 'x'"),
+        ({**PLANNED, "answer": ANSWER}, "verdict is missing"),
+        ({"problem": 0, "executed": 5}, "executed must be a table, got 5"),
+        ({"problem": 0, "executed": {"nominal": {"puck_speed_m_s": "x"}}}, "puck_speed_m_s must be a number"),
+    ],
+)
+def test_a_line_that_is_no_result_is_named(tmp_path: Path, row: Any, text: str) -> None:
+    open_results(tmp_path / "a.jsonl", {})
+    with (tmp_path / "a.jsonl").open("a") as file:
+        file.write(json.dumps(row) + "\n")
+    with pytest.raises(DatasetError, match=rf"a.jsonl is damaged: line 2: {re.escape(text)}.*; delete that line"):
+        open_results(tmp_path / "a.jsonl", {})
+
+
+def test_results_that_are_nested_without_end_are_as_if_cut_off_and_a_pipe_is_none(tmp_path: Path) -> None:
+    open_results(tmp_path / "a.jsonl", {})
+    with (tmp_path / "a.jsonl").open("a") as file:
+        file.write("[" * 100_000 + "\n")
+    assert open_results(tmp_path / "a.jsonl", {}).rows == {}
+    os.mkfifo(tmp_path / "b.jsonl")
+    with pytest.raises(UsageError, match="is a device or a pipe, expected the results of a planner"):
+        open_results(tmp_path / "b.jsonl", {})
+
+
 def test_mistakes_are_found_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"unknown planner 'cnpb'.*did you mean 'cnp-b'"):
         run_benchmark("hits-81", tmp_path, planners=["cnpb"])
@@ -158,7 +198,8 @@ def test_answers_read_back_as_they_were(tmp_path: Path) -> None:
     problem = load_suite("hits-81").problems(1)[0]
     trajectory = Trajectory(problem.boundary.start_q[0, :2] * 0 + [0.0, 1 / 3], problem.boundary.start_q[[0, 0]] / 3)
     results = open_results(tmp_path / "a.jsonl", {})
-    results.append({"problem": 0, "ending": "planned", "answer": answer_to_dict(trajectory)})
+    verdict = {"valid": False, "paper": {"valid": False, "finished": False}, "metrics": {}, "value_over_bound": {}}
+    results.append({**PLANNED, "answer": answer_to_dict(trajectory), "verdict": verdict})
     again = open_results(tmp_path / "a.jsonl", {})
     read = answer_from_dict(problem, again.rows[0]["answer"])
     assert isinstance(read, Trajectory)

@@ -63,6 +63,13 @@ def test_a_suite_has_pucks_or_draws_and_not_both(tmp_path: Path) -> None:
         load_suite(tmp_path / "both.toml")
 
 
+def test_a_grid_without_end_is_refused_before_it_is_made(tmp_path: Path) -> None:
+    text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
+    (tmp_path / "large.toml").write_text(text.replace("= 9", "= 9000000000"), encoding="utf-8")
+    with pytest.raises(RecipeError, match="a grid of 81,000,000,000,000,000,000 pucks is too large"):
+        load_suite(tmp_path / "large.toml")
+
+
 def test_pucks_need_a_table(tmp_path: Path) -> None:
     text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
     (tmp_path / "heavy.toml").write_text(text.replace('"airhockey"', '"heavy-object"'), encoding="utf-8")

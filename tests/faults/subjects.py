@@ -20,6 +20,7 @@ from cnpgen.errors import CnpgenError
 from cnpgen.loader.load import load_dataset
 from cnpgen.make.load import load_dataset_recipe
 from cnpgen.planner.model_file import load_model
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.boundary_file import read_boundary_file
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.load import load_plans
@@ -281,7 +282,8 @@ def _read_model(folder: Path, draw: Random) -> None:
     model = load_model(folder / "model.h5")
     str(model)
     if draw.random() < 0.3:
-        open_problem(model.problem)
+        base = open_problem(model.problem)[1].base
+        Planner(model, backend="numpy").plan(base, base + 0.1)
 
 
 def _read_checkpoint(folder: Path, draw: Random) -> None:

@@ -119,6 +119,10 @@ def test_two_splits_of_the_same_tasks_are_refused(recipe, tmp_path):
         (THREE + '\ngrid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [1, 1, 1]', "either a list of goals or a grid"),
         ('grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [2, 2]', "stage 1.counts: expected 3 entries"),
         (THREE + '\nstart = ["[0.6, 0, 0.16] m", "[0.7, 0, 0.16] m"]', "one for each of 4, got 2"),
+        (
+            'grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [1000000000000, 1000000000000, 1]',
+            "stage 1.counts: a grid of 1,000,000,000,000,000,000,000,000 goals is too large, expected at most 100,000",
+        ),
         ('grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [2, 0, 1]', "0 is too small, expected at least 1"),
     ],
 )

@@ -4,6 +4,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from cnpgen.plans import make_plans, record_problem
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import as_problem, as_record
+from cnpgen.problems.record import as_problem, as_record, open_problem
 from cnpgen.trajectory.boundary import Boundary
+from tests.examples.shaped_robot import write_problem
 
 ROOT = Path(__file__).parents[2]
 HEAVY = load_problem("heavy-object")
@@ -31,6 +33,14 @@ def test_a_record_is_rebuilt_once_and_its_urdf_stays() -> None:
     assert (problem.name, problem.constraint, problem.obstacle) == (HEAVY.name, HEAVY.constraint, HEAVY.obstacle)
     assert as_record(problem).comparable_sha256 == RECORD.comparable_sha256
     assert as_record(RECORD) is RECORD
+
+
+def test_a_problem_in_a_strangers_file_reads_no_mesh_from_the_disk(tmp_path: Path) -> None:
+    problem = load_problem(write_problem(tmp_path))
+    assert open_problem(record_problem(problem))[1].shape.pieces
+    outside = problem.urdf_path.read_text()
+    with pytest.raises(RecipeError, match=r"names the mesh 'package://crane/.*', expected its corners in the text"):
+        open_problem(replace(record_problem(problem), urdf=outside))
 
 
 def test_the_urdf_of_a_rebuilt_problem_is_gone_when_the_process_ends() -> None:

@@ -1,5 +1,6 @@
 """Shapes from URDFs: files are found or said to be missing, pieces are what they say, capsules cover them."""
 
+import base64
 import json
 import shutil
 from pathlib import Path
@@ -114,6 +115,41 @@ def test_what_is_no_mesh_is_said_to_be_none(tmp_path):
         with_inline_meshes(file.read_text(), file)
     assert "not a mesh that can be read" in caught.value.mistakes[0]
     assert "claw.obj' is missing" in caught.value.mistakes[1]
+
+
+def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monkeypatch):
+    file = write_crane(tmp_path)
+    monkeypatch.setattr("cnpgen.robots.shape.inline.MOST_MESH_BYTES", 400)
+    with pytest.raises(RecipeError, match=r"wedge.stl: has 484 bytes, expected a mesh of at most 400$"):
+        with_inline_meshes(file.read_text(), file)
+    (tmp_path / "crane" / "secret.txt").write_text("secret")
+    for name in ("secret.txt", f"file://{tmp_path}/crane/secret.txt"):
+        text = file.read_text().replace("package://crane/meshes/wedge.stl", name)
+        with pytest.raises(
+            RecipeError, match=r"secret.txt: not a mesh that can be read: expected one of .stl, .dae, .obj"
+        ):
+            with_inline_meshes(text, file)
+    text = file.read_text().replace("package://crane/meshes/wedge.stl", "a" * 5000)
+    with pytest.raises(RecipeError, match=r"the file 'a{56}\.\.\. is missing"):
+        with_inline_meshes(text, file)
+
+
+@pytest.mark.parametrize(
+    ("corners", "text"),
+    [
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "its 4 corners are not those of a body"),
+        ([[1, 1, 1]] * 8, "its 8 corners are not those of a body"),
+        ([], "its 0 corners are not those of a body"),
+        ([[0, 0, 0], [1e308, 0, 0], [0, 1e308, 0], [0, 0, -1e308]], "it reaches further than 10,000 m"),
+        ([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0], [0, 0, 1]], "numbers that are not finite"),
+    ],
+)
+def test_corners_that_a_stranger_wrote_into_a_text_are_those_of_a_body(corners, text):
+    content = base64.b64encode(np.array(corners, "<f8").tobytes()).decode()
+    mesh = f'<geometry><mesh filename="data:application/octet-stream;base64,{content}"/></geometry>'
+    with pytest.raises(RecipeError, match="the collision geometry of link 'hand' cannot be read") as caught:
+        link_pieces(urdf({**LINKS, "hand": [mesh], "fore": [], "claw": []}))
+    assert text in str(caught.value)
 
 
 @pytest.mark.parametrize(

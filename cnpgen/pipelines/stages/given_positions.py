@@ -1,5 +1,6 @@
 """Stage: positions that are listed, or evenly spaced in a box, one after the other instead of drawn."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from cnpgen.store.field import Field
 from cnpgen.symbolic.state import tip_position
 
 Position = tuple[float, float, float]
+MOST_TASKS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,13 +37,16 @@ class GivenPositions(Stage):
                 yield key, f"expected 3 entries, for x, y and z, got {len(getattr(self, key))}"
         if self.counts and not self.grid:
             yield "counts", "counts are for a grid, and there is none"
+        if self.tasks > MOST_TASKS:
+            yield "counts", f"a grid of {self.tasks:,} goals is too large, expected at most {MOST_TASKS:,}"
+            return
         if len(self.start) not in {0, 1, self.tasks}:
             yield "start", f"expected one position for all, or one for each of {self.tasks}, got {len(self.start)}"
 
     @property
     def tasks(self) -> int:
         """How many goals there are."""
-        return len(self.goal) or int(np.prod(self.counts))
+        return len(self.goal) or math.prod(self.counts)
 
     def describe(self) -> str:
         """Say which positions."""

@@ -7,6 +7,8 @@ from pathlib import Path
 from urllib.parse import unquote, urlparse
 
 from cnpgen.errors import PluginError, RecipeError
+from cnpgen.schema.catalogue import LONGEST
+from cnpgen.schema.units import show
 
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
@@ -55,10 +57,11 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
 
 def _find(name: str, beside: Path, packages: Sequence[Path]) -> Path:
     places = list(dict.fromkeys(_places(name, beside.absolute(), packages)))
-    found = next((place for place in places if place.is_file()), None)
+    found = next((place for place in places if os.path.isfile(place)), None)  # noqa: PTH113 - takes names of any length
     if found is None:
-        said = "\n".join(f"  {place}" for place in places) or "  nowhere: a file of this kind of address is not read"
-        raise RecipeError([f"the file {name!r} is missing; looked for at\n{said}{_hint(name)}"])
+        none = "  nowhere: a file of this kind of address is not read"
+        said = "\n".join(f"  {str(place)[:LONGEST]}" for place in places) or none
+        raise RecipeError([f"the file {show(name)} is missing; looked for at\n{said}{_hint(name)}"])
     return found
 
 

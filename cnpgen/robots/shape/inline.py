@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.files import find_named_file
-from cnpgen.robots.shape.hull import hull_corners
+from cnpgen.robots.shape.hull import FARTHEST, hull_corners
 from cnpgen.robots.urdf import urdf_tree
 
 Array = NDArray[np.float64]
 
 _INLINE = "data:application/octet-stream;base64,"  # followed by corners x, y, z [m] as little-endian float64
+_MESHES = (".stl", ".dae", ".obj")
+MOST_MESH_BYTES = 1 << 26  # of a file
 _CAPSULES = "1.2"  # the version of URDF that has capsules
 
 
@@ -53,6 +55,17 @@ def with_inline_meshes(urdf: str, path: Path, packages: Sequence[Path] = ()) -> 
     if unversioned:  # URDF's parser would complain on stderr about what it then leaves out
         tree.set("version", _CAPSULES)
     return ElementTree.tostring(tree, encoding="unicode") if meshes or unversioned else urdf
+
+
+def mesh_files(urdf: str) -> list[str]:
+    """List the mesh files that the collision geometry of a URDF names; inline meshes are none.
+
+    Raises:
+        ValueError: The text is no URDF.
+    """
+    meshes = urdf_tree(urdf).iterfind(".//collision/geometry/mesh")
+    names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
+    return [name for name in names if not name.startswith(_INLINE)]
 
 
 def points_of(mesh: ElementTree.Element) -> Array:
@@ -118,13 +131,18 @@ def scale_of(mesh: ElementTree.Element) -> Array:
 
 
 def _hull_of_file(path: Path, scale: Array) -> Array:
-    """Read a mesh (STL, DAE, OBJ and what else Coal's loader knows) and return the corners of its convex hull [m]."""
+    """Read a mesh and return the corners of its convex hull [m]."""
     import coal
 
+    if path.suffix.lower() not in _MESHES:
+        raise RecipeError([f"{path}: not a mesh that can be read: expected one of {', '.join(_MESHES)}"])
+    if (size := path.stat().st_size) > MOST_MESH_BYTES:
+        raise RecipeError([f"{path}: has {size:,} bytes, expected a mesh of at most {MOST_MESH_BYTES:,}"])
     try:
         points = np.array(coal.MeshLoader().load(str(path), scale).vertices(), float).reshape(-1, 3)
-    except (ValueError, RuntimeError) as error:
-        raise RecipeError([f"{path}: not a mesh that can be read: {error}"]) from error
-    if not len(points) or not np.isfinite(points).all():
-        raise RecipeError([f"{path}: the mesh has no points, or some that are not finite"])
+    except (ValueError, RuntimeError, MemoryError) as error:
+        said = [line for line in str(error).splitlines() if not line.startswith("Hint:")]
+        raise RecipeError([f"{path}: not a mesh that can be read: {said[-1] if said else 'too large'}"]) from error
+    if not len(points) or not (np.abs(points) <= FARTHEST).all():
+        raise RecipeError([f"{path}: the mesh has no points, or some further off than {FARTHEST:,.0f} m"])
     return hull_corners(points)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.shape.hull import CUBE, FARTHEST, check_solid
 from cnpgen.robots.shape.inline import points_of
 from cnpgen.robots.urdf import urdf_tree
 
@@ -80,6 +80,10 @@ def piece_of(link: str, element: ElementTree.Element) -> Piece:
     piece = Piece(link, *_core(shape)).moved(*origin_of(element.find("origin")))
     if not np.isfinite(piece.vertices).all():
         raise ValueError("it has numbers that are not finite")
+    if max(np.abs(piece.vertices).max(initial=0.0), piece.radius) > FARTHEST:
+        raise ValueError(f"it reaches further than {FARTHEST:,.0f} m: are its numbers in m?")
+    if shape.tag == "mesh":
+        check_solid(piece.vertices)
     return piece
 
 
