@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 STEP = 0.01  # s
 SAMPLES, ELITES, ITERATIONS = 64, 4, 30
 NEAR = 0.02  # rad: nearer than this is near enough
-MEMORY = 0.1  # of mean and spread, from one iteration to the next
+LEARNT = 0.1  # of mean and spread: so much of them is the elites', the rest stays
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,11 @@ class Steering:
             first, length = int(order[0]), int(lengths[order[0]])
             if away[first] < least:
                 best, least = (paths[first, :length], tips[first, length - 1]), float(away[first])
-            if least < NEAR:
-                break
             elites = controls[order[np.isfinite(away[order])]]
-            if len(elites):
-                mean = MEMORY * mean + (1 - MEMORY) * elites.mean(axis=0)
-                deviation = MEMORY * deviation + (1 - MEMORY) * elites.std(axis=0)
+            if least < NEAR or not len(elites):
+                break
+            mean = (1 - LEARNT) * mean + LEARNT * elites.mean(axis=0)
+            deviation = (1 - LEARNT) * deviation + LEARNT * elites.std(axis=0)
         return best
 
     def _drawn(self, mean: Array, deviation: Array) -> Array:
