@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
 from cnpgen.robots.shape.shape import Shape
+from cnpgen.world.clear import clear_states
 from cnpgen.world.scene import ENDLESS
 from cnpgen.world.sweep import sweep
 
@@ -124,6 +125,23 @@ class Bodies:
 
         return list(sweep(bounds, measure, separate))
 
+    def clear(self, pairs: Pairs, least: float) -> NDArray[np.bool_]:
+        """Say at which states all pairs of bodies are at least ``least`` [m] apart, shape (K,).
+
+        Args:
+            pairs: ``from_obstacles`` or ``among_links``.
+            least: The distance.
+        """
+        ends = [(self._bodies[a], self._bodies[b]) for a, b in pairs.tolist()]
+
+        def measure(pair: int, k: int) -> tuple[float, Array]:
+            return self._measure(*ends[pair], k)
+
+        def separate(pair: int, direction: Array, which: Pairs) -> Array:
+            return self._apart(*ends[pair], direction, which)
+
+        return clear_states(self._bounds(pairs), least, measure, separate)
+
     def corners(self) -> Array:
         """Compute corners of boxes that hold what every joint moves [m], shape (C, 3, K)."""
         found = [
@@ -167,11 +185,11 @@ class Bodies:
                 break
         return best, away
 
-    def _apart(self, a: _Body, b: _Body, direction: Array) -> Array:
-        """Compute how far b is from a along a direction in the frame of a at every state [m], shape (K,)."""
-        along = np.einsum("ijk,j->ik", self._rotations[a.frame], direction)
-        in_b = np.einsum("ijk,ik->jk", self._rotations[b.frame], along)
-        between = self._positions[b.frame] - self._positions[a.frame]
+    def _apart(self, a: _Body, b: _Body, direction: Array, which: "slice | Pairs" = slice(None)) -> Array:
+        """Compute how far b is from a along a direction in the frame of a at every state, or some [m], shape (K,)."""
+        along = np.einsum("ijk,j->ik", self._rotations[a.frame][..., which], direction)
+        in_b = np.einsum("ijk,ik->jk", self._rotations[b.frame][..., which], along)
+        between = self._positions[b.frame][:, which] - self._positions[a.frame][:, which]
         reach = float((a.corners @ direction).max()) + a.radius + b.radius
         return np.asarray((b.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
 
