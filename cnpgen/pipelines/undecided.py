@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.pipelines.context import Context
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint, End
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.linalg import Scalar
 from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
 
 if TYPE_CHECKING:
@@ -42,18 +43,33 @@ def settle(context: Context, end: End, *, exact: bool = True) -> Settle | None:
         return None
     kernel = context.kernels.load(undecided, end=end, dtype=context.dtype)
     world = World(robot, problem.obstacle, problem.object_size)
+    path = PathWorld(robot, problem.obstacle, problem.object_size)
 
     def decide(state: tuple[Array, Array, Array], tops: Array, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
         (doubts,) = kernel(*state, tops)
-        broken = np.zeros(doubts.shape, bool)
-        for draw in np.flatnonzero(asked & (doubts > 0).any(axis=0)):
+        open_, broken = (doubts > 0) & asked, np.zeros(doubts.shape, bool)
+        for row in np.flatnonzero(open_.any(axis=1)) if np.all(tops == tops[:, :1]) else ():
+            draws = np.flatnonzero(open_[row])
+            slack = _slack(problem.constraint[row], context.dtype, exact=exact)
+            q, dq, ddq = (np.ascontiguousarray(values[:, draws], float) for values in state)
+            path.set_path(q, dq, ddq, tops[:, 0])
+            met = problem.constraint[row].met(path, slack)
+            if met is not None:
+                open_[row, draws], broken[row, draws] = False, ~met
+        for draw in np.flatnonzero(open_.any(axis=0)):
             q, dq, ddq = (np.ascontiguousarray(values[:, draw]) for values in state)
             world.set_state(q, dq, ddq, tops[:, draw])
-            for row in np.flatnonzero(doubts[:, draw] > 0):
+            for row in np.flatnonzero(open_[:, draw]):
                 broken[row, draw] = _breaks(problem.constraint[row], world, end, context.dtype, exact=exact)
         return broken
 
     return decide
+
+
+def _slack(constraint: Constraint, dtype: str, *, exact: bool) -> float:
+    """How far a boundary state may be outside a condition of lengths [m]."""
+    slack = EXACTNESS[dtype]["position"]
+    return slack if exact else max(slack, constraint.tolerance)
 
 
 def _breaks(constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool) -> bool:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.attached import Attached, Body
 from cnpgen.robots.chain import chain_from_model
@@ -158,3 +159,17 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
             f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} rad is outside its planning"
             f" limits [{low[worst]:g}, {high[worst]:g}]"
         )
+    for table in (each for each in problem.constraint if isinstance(each, Table)):
+        height = _tip_height(robot, base)
+        if height < table.z - max(table.band, table.tolerance):
+            text = f"the tip is {table.z - height:.3g} m below the table, at z = {height:.4g} m, expected {table.z:g} m"
+            yield f"{problem.path}: robot.base: {text} or more: is the tip the frame that you mean, and 'z' its height?"
+
+
+def _tip_height(robot: Robot, q: Array) -> float:
+    """Return the height of the tip at joint positions q [m]."""
+    import pinocchio as pin
+
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    return float(pin.updateFramePlacement(robot.model, data, robot.tip_frame).translation[2])

@@ -10,6 +10,7 @@ from cnpgen.robots.shape.hull import CUBE, ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Solid, same_shape
 from cnpgen.world.certified import CertifiedDistance, body
+from cnpgen.world.clear import clear_states
 from cnpgen.world.sweep import sweep
 
 Array = NDArray[np.float64]
@@ -93,6 +94,23 @@ class Bodies:
 
         return list(sweep(bounds, measure, separate))
 
+    def clear(self, pairs: Pairs, least: float) -> NDArray[np.bool_]:
+        """Say at which states all pairs of bodies are at least ``least`` [m] apart, shape (K,).
+
+        Args:
+            pairs: ``from_obstacles`` or ``among_links``.
+            least: The distance.
+        """
+        ends = [(int(a), int(b)) for a, b in pairs]
+
+        def measure(pair: int, k: int) -> tuple[float, Array]:
+            return self._measure(*ends[pair], k)
+
+        def separate(pair: int, direction: Array, which: Pairs) -> Array:
+            return self._apart(*ends[pair], direction, which)
+
+        return clear_states(self._bounds(pairs), least, measure, separate)
+
     def corners(self) -> Array:
         """Compute corners of boxes that hold what every joint moves [m], shape (C, 3, K)."""
         found = [
@@ -120,12 +138,12 @@ class Bodies:
         distance, away = self._coal.between(self._bodies[a], pose_a, self._bodies[b], pose_b)
         return distance, away @ pose_a[0]
 
-    def _apart(self, a: int, b: int, direction: Array) -> Array:
-        """Compute how far b is from a along a direction in the frame of a at every state [m], shape (K,)."""
+    def _apart(self, a: int, b: int, direction: Array, which: "slice | Pairs" = slice(None)) -> Array:
+        """Compute how far b is from a along a direction in the frame of a at every state, or some [m], shape (K,)."""
         (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
-        along = np.einsum("ijk,j->ik", self._rotations[frame], direction)
-        in_b = np.einsum("ijk,ik->jk", self._rotations[other], along)
-        between = self._positions[other] - self._positions[frame]
+        along = np.einsum("ijk,j->ik", self._rotations[frame][..., which], direction)
+        in_b = np.einsum("ijk,ik->jk", self._rotations[other][..., which], along)
+        between = self._positions[other][:, which] - self._positions[frame][:, which]
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
         return np.asarray((second.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
 

@@ -178,6 +178,16 @@ class PathWorld:
         bodies = self._placed_bodies()
         return bodies.distances(bodies.among_links)
 
+    def clear_of_obstacles(self, least: float) -> NDArray[np.bool_]:
+        """Say at which states all moving pieces of the robot's shape are so far from all obstacles [m], shape (K,)."""
+        bodies = self._placed_bodies()
+        return bodies.clear(bodies.from_obstacles, least)
+
+    def clear_of_itself(self, least: float) -> NDArray[np.bool_]:
+        """Say at which states all pieces of the robot's shape that must not touch are so far apart [m], shape (K,)."""
+        bodies = self._placed_bodies()
+        return bodies.clear(bodies.among_links, least)
+
     def arm_points(self) -> Array:
         """Compute points of the arm of which one moves as far as any point of it, or further [m], shape (P, 3, K).
 

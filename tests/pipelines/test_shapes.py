@@ -18,6 +18,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.solver.residuals import stage_values
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
 from tests.conftest import Prepare, run_stages
 from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_problem
@@ -59,10 +60,11 @@ def measured(context: Context, drawn: np.ndarray) -> np.ndarray:
 def test_ends_are_decided_by_the_pieces_and_only_where_capsules_are_not_clear(context, drawn, monkeypatch):
     decide, asked = settle(context, "start"), []
     tops, still = tops_of(context, drawn.shape[1]), np.zeros_like(drawn)
-    real = World.set_state
-    monkeypatch.setattr(World, "set_state", lambda *x: (asked.append(x[1]), real(*x))[1])
+    real = PathWorld.set_path
+    monkeypatch.setattr(PathWorld, "set_path", lambda *x: (asked.append(x[1].shape[1]), real(*x))[1])
     broken = decide((drawn, still, still), tops, np.ones(drawn.shape[1], bool))
-    assert 0.1 < len(asked) / drawn.shape[1] < 0.9
+    assert all(0.1 < states / drawn.shape[1] < 0.9 for states in asked)
+    assert len(asked) == 2  # obstacles, and the robot itself
     monkeypatch.undo()
     distances = measured(context, drawn)
     names = [type(each).__name__ for each in context.problem.constraint]
@@ -72,6 +74,19 @@ def test_ends_are_decided_by_the_pieces_and_only_where_capsules_are_not_clear(co
     (doubts,) = context.kernels.load(undecided, end="start", dtype="float64")(drawn, still, still, tops)
     saved = (doubts[names.index("RobotClearance")] > 0) & (distances[0] > 0)
     assert saved.sum() > 10  # ends that capsules would have refused
+
+
+def test_where_obstacles_stand_elsewhere_in_every_draw_states_are_decided_one_by_one(context, drawn, monkeypatch):
+    few = drawn[:, :60].copy()
+    tops, still = tops_of(context, 60), np.zeros_like(few)
+    other = tops.copy()
+    other[1, 0] += 1.0
+    everybody = np.ones(60, bool)
+    together = settle(context, "start")((few, still, still), tops, everybody)
+    monkeypatch.setattr(PathWorld, "clear_of_obstacles", None)
+    alone = settle(context, "start")((few, still, still), other, everybody)
+    np.testing.assert_array_equal(alone[:, 1:], together[:, 1:])
+    assert alone.any()
 
 
 def test_what_nobody_asks_for_is_not_decided(context, drawn):

@@ -118,6 +118,15 @@ def test_base_outside_its_limits_names_the_joint_that_is_furthest_out():
     assert "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]" in mistake
 
 
+def test_a_tip_below_the_table_is_a_mistake_with_its_height():
+    table = next(each for each in AIRHOCKEY.constraint if type(each).__name__ == "Table")
+    lifted = tuple(replace(each, z=1.0, start_band=0.01) if each is table else each for each in AIRHOCKEY.constraint)
+    found = mistake_of(replace(AIRHOCKEY, constraint=lifted))
+    assert "robot.base: the tip is 0.84 m below the table, at z = 0.16 m, expected 1 m or more" in found
+    above = tuple(replace(each, z=0.165, start_band=0.01) if each is table else each for each in AIRHOCKEY.constraint)
+    load_robot(replace(AIRHOCKEY, constraint=above))  # as far off as motions may start
+
+
 def test_base_on_its_limit_is_inside():
     robot = load_robot(HEAVY)
     assert load_robot(changed(HEAVY, base=tuple(robot.position_upper))).base[0] == robot.position_upper[0]

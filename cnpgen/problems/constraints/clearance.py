@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 
     from cnpgen.robots.obstacle import Obstacle
     from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.world.path import PathWorld
     from cnpgen.world.state import World
 
 
@@ -59,6 +61,10 @@ class RobotClearance(Constraint):
             (found,) = self._clear(world.shape_distances(), [0.0])
             bodies = [piece.link for piece in shape.moving_pieces]
         return (replace(found, parts=tuple(f"{body}, {box.name}" for body in bodies for box in world.obstacles)),)
+
+    def met(self, path: "PathWorld", slack: float) -> NDArray[np.bool_] | None:
+        """Say at which states the links' pieces are far enough from the obstacles."""
+        return path.clear_of_obstacles(self.distance - slack) if path.robot.shape else None
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""

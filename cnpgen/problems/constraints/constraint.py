@@ -11,6 +11,7 @@ from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.world.path import PathWorld
     from cnpgen.world.state import World
 
 End = Literal["start", "goal"]
@@ -150,6 +151,17 @@ class Constraint(ABC):
         ``sum()`` over a vector. Every entry of a condition's ``g`` is then a float or an array of shape (K,); bounds do
         not depend on the state.
         """
+
+    def met(self, path: "PathWorld", slack: float) -> NDArray[np.bool_] | None:  # noqa: ARG002
+        """Say at which of the K states that a path holds ``measured`` is met up to a slack, if it is cheaper to ask so.
+
+        By default nothing is said; overridden where many states are settled together.
+
+        Args:
+            path: The states; obstacles stand where they stand in all of them.
+            slack: How far values may be outside their bounds [unit of the condition].
+        """
+        return None
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of ``symbolic`` with numbers in the place of expressions; solvers read bounds off them.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import field
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.pairs import LinkPair
     from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.world.path import PathWorld
     from cnpgen.world.state import World
 
 
@@ -39,6 +41,10 @@ class SelfClearance(Constraint):
         links = [piece.link for piece in shape.pieces] if shape else []
         pairs = shape.apart if shape else ()
         return (replace(found, parts=tuple(f"{links[i]}, {links[j]}" for i, j in pairs)),)
+
+    def met(self, path: "PathWorld", slack: float) -> NDArray[np.bool_]:
+        """Say at which states the links' pieces are far enough apart."""
+        return path.clear_of_itself(self.distance - slack)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
