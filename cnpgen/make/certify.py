@@ -9,13 +9,12 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256
+from cnpgen.make.stage_planner import SHA256, asked, load_stage_planner, model_sha256
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.trajectory.boundary import Boundary
 
 NO_PLAN = "no plan found"
 
@@ -79,7 +78,7 @@ class CertifiedPlan(Stage):
 
         def work(draws: Round, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
-            given = None if planner is None else planner.plan_batch(Boundary.from_batch(columns, None)).motion
+            given = None if planner is None else planner.plan_batch(asked(columns)).motion
             with one_thread():
                 motion, valid = solve(columns, given)
             draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)

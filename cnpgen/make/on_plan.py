@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.stage_planner import SHA256, load_stage_planner
+from cnpgen.make.stage_planner import SHA256, asked, load_stage_planner
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.motion import onto_table, velocity_of_tip
@@ -17,7 +17,6 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 from cnpgen.symbolic.state import tip_position
-from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.moment import states_at_times
 from cnpgen.trajectory.motion import Motion
 
@@ -99,7 +98,7 @@ class StartOnPlan(Stage):
 
         def make(draws: Round, refined: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Motion]:
             columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
-            motion = planner.plan_batch(Boundary.from_batch(columns, None)).motion
+            motion = planner.plan_batch(asked(columns)).motion
             owner, some = np.arange(len(motion)), np.flatnonzero(refined)
             few = some[::MOMENTS]
             owner[some] = np.repeat(few, MOMENTS)[: len(some)]

@@ -1,13 +1,21 @@
 """The planner that a stage plans with: rows depend on its numbers, so that recipes say which file it must be."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.record import record_problem
+from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
     from cnpgen.planner.planner import Planner
+
+Array = NDArray[np.float64]
 
 SHA256 = "^([0-9a-f]{64})?$"
 
@@ -50,3 +58,8 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
         differs = ", ".join(problem.differences(loaded.problem)[:4])
         raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}"])
     return Planner(loaded, backend=context.kernels.backend)
+
+
+def asked(columns: Mapping[str, Array]) -> Boundary:
+    """Return what a planner is asked for N rows with columns of shape (N, width): goal accelerations are free."""
+    return Boundary(*(columns[name] for name in BOUNDARY))

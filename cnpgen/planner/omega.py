@@ -20,7 +20,7 @@ from cnpgen.planner.curves import FIXED_AT_GOAL
 from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
-from cnpgen.planner.tasks import Tasks
+from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.obstacles import obstacle_tops
@@ -47,6 +47,7 @@ class Omega:
         path_scale: What phi is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps that bend the path.
+        expected_time: What rates are multiples of the inverse of: "distance", as in the paper, or "reach" (``Meaning``).
         backend: Which kernels run; by default the fastest that works here.
         cache_folder: Where kernels are kept; by default where all are.
 
@@ -67,12 +68,16 @@ class Omega:
         path_scale: float = 0.5,
         bending_steps: int = 1,
         landing_steps: int = 1,
+        expected_time: str = "distance",
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
         self.problem, self._scale = as_problem(problem), number("path_scale", path_scale)
         self._bending = integer("bending_steps", bending_steps, least=0)
         self._landed = integer("landing_steps", landing_steps, least=0)
+        if expected_time not in EXPECTED_TIMES:
+            raise UsageError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}")
+        self._time = expected_time
         spec = self.problem.trajectory
         self.path_outputs = (spec.path_control_points - 3 - FIXED_AT_GOAL) * len(self.problem.robot.joints)
         self.rate_outputs = spec.rate_control_points
@@ -89,7 +94,8 @@ class Omega:
         robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
         bent = has_equalities(kernels)
         with kernels.compiling_together():
-            prepare = prepare_tasks(problem, robot, kernels, bending_steps=self._bending if bent else 0)
+            steps = self._bending if bent else 0
+            prepare = prepare_tasks(problem, robot, kernels, bending_steps=steps, expected_time=self._time)
             return prepare, make_landing(problem, kernels, steps=self._landed) if bent and self._landed else None
 
     @one_thread()

@@ -196,13 +196,18 @@ class Refiner:
         return self._measured(task, x, outcome, at_any_cost=True)
 
     def _from_others(self, task: Task, given: Array | None, best: Attempt) -> Iterator[Attempt]:
-        """Yield the dearest plans: from the given one with more care, and from other starts; ``best`` is so far."""
+        """Yield the dearest plans: from the given one with more care, from other starts, from the best one of all.
+
+        ``best`` is the best one so far.
+        """
         for x in [*([] if given is None else [given]), *self._other_starts(task)]:
             other = self._attempt(task, self.passes.other, x, Outcome.RESTARTED)
             yield other
             best = other if other.is_better(best) else best
+        last = self._slowed(task, best, at_any_cost=True) if task.at_rest else best
+        yield self._attempt(task, self.passes.given, last.x, Outcome.RESTARTED)
         if task.at_rest:  # what is left to be said of it is why no speed is slow enough
-            yield self._slowed(task, best, at_any_cost=True)
+            yield last
 
     def minimise(self, task: Task, which: Pass, x: Array) -> Result:
         """Run one pass from variables x, shape (nx,)."""

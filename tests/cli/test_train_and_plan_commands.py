@@ -125,10 +125,24 @@ def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
 def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path):
     path = tmp_path / "m.h5"
     chosen = ["--growth", "3", "--learning-rate", "2e-3", "--seed", "7", "--metric", "bounded", "--quiet"]
+    chosen += [
+        "--margin",
+        "joint-velocity=0.97",
+        "--margin",
+        "table=1",
+        "--expected-time",
+        "reach",
+        "--rate-bias",
+        "-0.1",
+    ]
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL, *chosen]) == 0
     settings = load_model(path).training["settings"]
     assert (settings["learning_rate"], settings["seed"]) == (2e-3, 7)
     assert (settings["metric"]["kind"], settings["metric"]["growth"]) == ("learned", 3.0)
+    assert (settings["margins"], settings["rate_bias"]) == ({"joint-velocity": 0.97, "table": 1.0}, -0.1)
+    assert load_model(path).meaning.expected_time == "reach"
+    said = "--expected-time reach --rate-bias -0.1 --margin joint-velocity=0.97 --margin table=1 --seed 7 --check 2"
+    assert said in load_model(path).training["command"]
 
 
 @pytest.mark.parametrize(("number", "code", "what"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
@@ -169,6 +183,8 @@ def test_growth_that_changes_nothing_is_refused(tiny, tmp_path, capsys):
         ["--metric", "paper"],
         ["--learning-rate", "inf"],
         ["--growth", "inf"],
+        ["--margin", "joint-velocity"],
+        ["--margin", "joint-velocity=1.2"],
         ["--steps", "0"],
         ["--steps", "5", "--epochs", "2"],
         ["--learning-rate", "-1"],

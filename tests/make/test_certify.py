@@ -162,6 +162,11 @@ def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
     np.testing.assert_allclose(one["duration"], other["duration"], rtol=0.03)
 
 
+def test_transports_begin_with_a_planners_plans_too(tmp_path: Path) -> None:
+    made = make_dataset("heavy-object", tmp_path / "out", n=3, certify=True, model="heavy-object", workers=1)
+    assert len(open_dataset(made.folder).read("train")["duration"]) == 3
+
+
 def test_recipes_without_a_planner_are_written_as_before() -> None:
     recipe = load_dataset_recipe("airhockey-hit")
     assert resolved(certified(recipe))["pipeline"]["stage"][-1] == {"use": "certified-plan"}

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from cnpgen.errors import UsageError
+from cnpgen.planner.omega import Omega
 from cnpgen.planner.tasks import SHORTEST_REACH, reaching_time
 from cnpgen.trajectory.boundary import Boundary
+from tests.examples.plans import ROBOTS
 
 STEPS = 80
 
@@ -52,3 +55,14 @@ def test_the_slowest_joint_counts_and_no_time_is_shorter_than_the_floor() -> Non
 def test_who_moves_the_wrong_way_takes_longer() -> None:
     towards, away = (one_joint(0, v, 0.3, 0.0, velocity=1.0, acceleration=10.0) for v in (0.8, -0.8))
     assert away == pytest.approx(towards + 2 * 0.8 / 10.0)  # back to where it was, now the right way
+
+
+def test_control_points_for_other_frameworks_may_be_of_either_time() -> None:
+    random = np.random.default_rng(1)
+    boundary = Boundary(*random.uniform(-0.3, 0.3, (5, 3, 6)))
+    omega = Omega("airhockey", bending_steps=0, landing_steps=0, expected_time="reach", backend="numpy")
+    robot = ROBOTS["airhockey"]
+    expected = reaching_time(boundary, robot.velocity_limit, robot.acceleration_limit)
+    np.testing.assert_allclose(omega.tasks(boundary).expected_time, expected, rtol=1e-12)
+    with pytest.raises(UsageError, match="expected_time must be one of distance, reach, got 'soon'"):
+        Omega("airhockey", expected_time="soon")

@@ -41,7 +41,7 @@ def test_slowing_down_pays_in_a_motion_of_seconds_too() -> None:
 
 
 def attempt_after(monkeypatch: pytest.MonkeyPatch, rounds: int):
-    """The first attempt at a transport whose first pass ends with a rate that is too even, so too fast in places."""
+    """The first attempt at a transport whose first pass ends with a rate that is too even: somewhere too fast."""
     plan, tool = load("transport"), refiner("heavy-object")
     asked = task(plan)
     rate = 0.4 * plan.motion.rate[0] + 0.6 / plan.motion.duration()[0]

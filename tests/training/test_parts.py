@@ -142,3 +142,40 @@ def test_every_constraint_of_a_kind_has_the_margin_of_its_kind():
     margins = suggested_margins(("time", "table", "table-2", "joint-torque-3", "keep-out-2"))
     assert margins.insets == {"table": 1e-3, "table-2": 1e-3}
     assert margins.factors == {"joint-torque-3": 0.97}
+
+
+def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: pytest.MonkeyPatch):
+    from cnpgen.training import prepare
+    from tests.examples.models import interpreted, surroundings_of
+
+    made: list[dict[str, Any]] = []
+
+    class Watched(prepare.PlanLoss):
+        def __init__(self, *positional: Any, **named: Any) -> None:
+            made.append(named)
+            super().__init__(*positional, **named)
+
+        def load_kernels(self) -> None:
+            """Not now."""
+
+    monkeypatch.setattr(prepare, "PlanLoss", Watched)
+    given = interpreted(surroundings_of("airhockey"))
+    prepare._loss(given, TrainingSettings(margins={"joint-acceleration": 0.9}))
+    usual = suggested_margins(Watched(given.problem, backend="numpy").terms)
+    factors = made[1]["margins"].factors
+    assert factors == {**usual.factors, "joint-acceleration": 0.9}
+    assert made[1]["margins"].insets == usual.insets
+    with pytest.raises(UsageError, match="no such term"):
+        prepare._loss(given, TrainingSettings(margins={"joint-speed": 0.9}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"margins": {"joint-velocity": 1.5}}, r"margin of 'joint-velocity' must be in \(0, 1\], got 1.5"),
+        ({"expected_time": "soon"}, "expected_time must be one of distance, reach, got 'soon'"),
+    ],
+)
+def test_margins_and_expected_times_that_cannot_be_meant_are_refused(changes: dict[str, Any], message: str):
+    with pytest.raises(UsageError, match=message):
+        TrainingSettings(**changes)
