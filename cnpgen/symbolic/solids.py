@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Size = tuple[float, float, float]
 Hold = Callable[[Scalar], Scalar]
 
-HALVINGS = 8  # of a segment, after which its point nearest to a cylinder is known
+HALVINGS = 6  # of a segment, after which its point nearest to a cylinder is known
 PARALLEL = 1e-12  # of the sine squared of an angle: edges that are closer to parallel have no common normal
 
 
@@ -196,9 +196,9 @@ class RoundForm(SymbolicSolid):
     second: Vec
     radius: Scalar
 
-    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:  # noqa: ARG002
+    def separation(self, first: Vec, second: Vec, hold: Hold) -> Scalar:
         """Return the exact signed distance, or minus the radius where the segments cross."""
-        return segment_distance((first, second), (self.first, self.second)) - self.radius
+        return segment_distance((first, second), (self.first, self.second), hold=hold) - self.radius
 
     def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Return the exact signed distance."""

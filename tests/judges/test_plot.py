@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.judges.plans.plot import plot_plan
+from cnpgen.robots.solid import place_obstacles, solids_of
+from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import Plan, bent, course, load
 
 again = pytest.mark.extended  # the same claim, with the other of two plans
@@ -33,6 +35,11 @@ def axes_of(figure: Figure) -> dict[str, Any]:
     """Axes by the label of their y axis or their title."""
     axes = [axis for part in figure.subfigs for axis in part.axes]
     return {axis.get_title() or axis.get_ylabel(): axis for axis in axes}
+
+
+def shadow(patch: Any) -> Any:
+    """The box round a patch."""
+    return patch.get_path().get_extents(patch.get_patch_transform())
 
 
 @pytest.mark.parametrize(
@@ -90,8 +97,8 @@ def test_a_transport_is_drawn_from_the_side_and_from_above(drawn):
     draw(plan, Path("plan.png"))
     axes, seen = axes_of(drawn[0]), course(plan, 2001)
     tops = [plan.start_xyz[0, 2] - 0.15, plan.goal_xyz[0, 2] - 0.15]
-    assert [patch.get_bbox().y1 for patch in axes["side view"].patches] == pytest.approx(tops)
-    assert [patch.get_bbox().bounds for patch in axes["top view"].patches] == [
+    assert [shadow(patch).y1 for patch in axes["side view"].patches] == pytest.approx(tops)
+    assert [shadow(patch).bounds for patch in axes["top view"].patches] == [
         pytest.approx((-0.6, 0.2, 0.3, 0.4)),
         pytest.approx((0.3, 0.2, 0.3, 0.4)),
     ]
@@ -103,7 +110,7 @@ def test_a_transport_is_drawn_from_the_side_and_from_above(drawn):
 def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_is_told(drawn):
     plan = load("transport")
     plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), tops=np.array([0.1, 0.2]), note="not valid")
-    assert [patch.get_bbox().y1 for patch in axes_of(drawn[0])["side view"].patches] == pytest.approx([0.1, 0.2])
+    assert [shadow(patch).y1 for patch in axes_of(drawn[0])["side view"].patches] == pytest.approx([0.1, 0.2])
     assert drawn[0].get_suptitle() == f"heavy-object, plan 0: {plan.motion.duration()[0]:.3f} s\nnot valid"
 
 
@@ -152,3 +159,14 @@ def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MachineError, match=r"cnpgen\[plot\]"):
         draw(load("hit"), tmp_path / "plan.png")
+
+
+def test_obstacles_of_every_kind_are_drawn_where_they_are(drawn):
+    plan, random = load("transport"), np.random.default_rng(1)
+    obstacles = tuple(draw_obstacle(kind, random) for kind in KINDS)
+    plot_plan(replace(plan.problem, obstacle=obstacles), plan.robot, plan.motion, 0, Path("plan.png"))
+    axes, tops = axes_of(drawn[0]), place_obstacles(obstacles)
+    for title, up in (("side view", 2), ("top view", 0)):
+        shadows = [shadow(patch) for patch in axes[title].patches]
+        for solid, found in zip(solids_of(obstacles, tops), shadows, strict=True):
+            np.testing.assert_allclose([found.min, found.max], [solid.low[[1, up]], solid.high[[1, up]]], atol=2e-3)

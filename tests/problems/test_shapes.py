@@ -106,7 +106,7 @@ def test_the_distance_that_is_asked_for_is_kept(bench):
 def _distance() -> tuple[ca.Function, ca.Function]:
     points = [symbols(name, 3) for name in "abcd"]
     (a, b, c, d), columns = [scalars for _, scalars in points], [column for column, _ in points]
-    distance = segment_distance((a, b), (c, d))
+    distance = segment_distance((a, b), (c, d), hold=lambda value: value)
     gradient = ca.densify(ca.jacobian(distance, ca.vertcat(*columns)))
     return ca.Function("distance", columns, [distance]), ca.Function("gradient", columns, [gradient])
 

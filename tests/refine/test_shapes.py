@@ -11,9 +11,9 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.trajectory.motion import Motion
 from tests.conftest import needs_compiler
-from tests.examples.example_robots import folder, needs_robots, write_panda
+from tests.examples.example_robots import CLUTTER, folder, needs_robots, write_panda
 from tests.examples.meshes import Meshes, states
-from tests.examples.shaped_robot import write_pipeline, write_problem
+from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_problem
 
 pytestmark = needs_compiler
 
@@ -31,8 +31,9 @@ def valid_states(plans: Plans) -> list[np.ndarray]:
     return [states(plans, index) for index, verdict in enumerate(verdicts) if verdict.valid]
 
 
-def test_valid_plans_touch_nothing(tmp_path):
-    problem = load_problem(write_problem(tmp_path))
+@pytest.mark.parametrize("obstacles", [OBSTACLES, KINDS], ids=["boxes", "kinds"])
+def test_valid_plans_touch_nothing(tmp_path, obstacles):
+    problem = load_problem(write_problem(tmp_path, obstacles=obstacles))
     write_pipeline(tmp_path)
     meshes = Meshes(problem, load_robot(problem), tmp_path)
     found = valid_states(solved(tmp_path, 12))
@@ -55,6 +56,16 @@ def test_plans_may_have_to_stop_without_acceleration(tmp_path):
 @pytest.mark.extended
 def test_a_panda_between_shelves_touches_nothing(tmp_path):
     problem = load_problem(write_panda(tmp_path))
+    meshes = Meshes(problem, load_robot(problem), folder())
+    found = valid_states(solved(tmp_path, 40))
+    assert len(found) >= 30
+    assert not any(meshes.touches(q) for path in found for q in path)
+
+
+@needs_robots
+@pytest.mark.extended
+def test_a_panda_among_ten_obstacles_of_four_kinds_touches_nothing(tmp_path):
+    problem = load_problem(write_panda(tmp_path, obstacles=CLUTTER))
     meshes = Meshes(problem, load_robot(problem), folder())
     found = valid_states(solved(tmp_path, 40))
     assert len(found) >= 30

@@ -7,12 +7,15 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.problems.robot import load_robot
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.spec import Payload
 from cnpgen.schema.keys import PerJoint
 from cnpgen.simulator import hockey
 from cnpgen.simulator.controller import Controller
 from cnpgen.simulator.plant import PLANTS, Plant
 from cnpgen.simulator.scene import Scene, scene_xml
+from cnpgen.world.state import World
+from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import PROBLEMS, ROBOTS
 
 mujoco = pytest.importorskip("mujoco")
@@ -122,3 +125,24 @@ def test_a_bounce_is_as_strong_as_it_was_asked_to_be(restitution: float, monkeyp
     data.qpos[-2:], data.qvel[-2:] = (1.5, hockey.WIDTH / 2 - hockey.PUCK_RADIUS - 0.05), (0.0, 2.0)
     mujoco.mj_step(model, data, 400)
     assert -data.qvel[-1] == pytest.approx(2.0 * restitution, abs=0.07)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_obstacles_of_every_kind_are_as_far_away_as_judges_say(kind: str) -> None:
+    problem, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
+    random = np.random.default_rng(6)
+    obstacles = tuple(draw_obstacle(kind, random, spread=0.5) for _ in range(3))
+    problem = replace(problem, obstacle=tuple(replace(each, name=f"it {i}") for i, each in enumerate(obstacles)))
+    tops = place_obstacles(problem.obstacle)
+    model = mujoco.MjModel.from_xml_string(scene_xml(Scene(problem, robot, PLANTS["nominal"], tops)))
+    data, world = mujoco.MjData(model), World(robot, problem.obstacle, problem.object_size)
+    held, zero = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "object"), np.zeros(robot.n)
+    for q in random.uniform(robot.position_lower, robot.position_upper, (20, robot.n)):
+        world.set_state(q, zero, zero, tops)
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        for index, expected in enumerate(world.object_distances()):
+            geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"it {index}")
+            found = mujoco.mj_geomDistance(model, data, held, geom, 10.0, None)
+            if expected > 0.01:  # the object is 2 mm smaller on every side than it is judged
+                assert 0 <= found - expected < 0.004

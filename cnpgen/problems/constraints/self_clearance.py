@@ -59,7 +59,7 @@ class SelfClearance(Constraint):
         from cnpgen.symbolic.segments import segment_distance
 
         ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
-        distances = [segment_distance((a, b), (c, d)) for (a, b, _), (c, d, _) in ends]
+        distances = [segment_distance((a, b), (c, d), hold=state.hold) for (a, b, _), (c, d, _) in ends]
         return self._least(distances, _radii(state.robot, pairs), sufficient=True)
 
     def _least(self, distances: list[Any], radii: list[float], *, sufficient: bool) -> tuple[Condition, ...]:
