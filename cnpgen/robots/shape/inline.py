@@ -6,6 +6,7 @@ A plan, a dataset or a planner carries its problem as text; so the shape of the 
 import base64
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,6 +16,9 @@ from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.files import find_named_file
 from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.robots.urdf import urdf_tree
+
+if TYPE_CHECKING:
+    import coal
 
 Array = NDArray[np.float64]
 
@@ -87,13 +91,30 @@ def scale_of(mesh: ElementTree.Element) -> Array:
 
 
 def _hull_of_file(path: Path, scale: Array) -> Array:
-    """Read a mesh (STL, DAE, OBJ and what else Coal's loader knows) and return the corners of its convex hull [m]."""
-    import coal
-
-    try:
-        points = np.array(coal.MeshLoader().load(str(path), scale).vertices(), float).reshape(-1, 3)
-    except (ValueError, RuntimeError) as error:
-        raise RecipeError([f"{path}: not a mesh that can be read: {error}"]) from error
+    """Return the corners of the convex hull of a mesh [m]."""
+    points = read_mesh(path, scale)[0]
     if not len(points) or not np.isfinite(points).all():
         raise RecipeError([f"{path}: the mesh has no points, or some that are not finite"])
     return hull_corners(points)
+
+
+def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
+    """Read a mesh (STL, DAE, OBJ and what else Coal's loader knows).
+
+    Args:
+        path: The file.
+        scale: Factors of its x, y and z, shape (3,).
+
+    Returns:
+        Its points [m], shape (N, 3), and the mesh as Coal has it.
+
+    Raises:
+        RecipeError: It cannot be read.
+    """
+    import coal
+
+    try:
+        mesh = coal.MeshLoader().load(str(path), scale)
+        return np.array(mesh.vertices(), float).reshape(-1, 3), mesh
+    except (ValueError, RuntimeError) as error:
+        raise RecipeError([f"{path}: not a mesh that can be read: {error}"]) from error
