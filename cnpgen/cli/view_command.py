@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 _TEXT = """\
 One file that needs no network: the arm with its meshes, its obstacles, the path of its tip, a slider of time, and its
 joints against their limits. A plan moves; a row without a plan is shown at its start and its goal, a problem in its
-base configuration. Meshes that a plan's URDF names are looked for where ROS_PACKAGE_PATH says; without them the arm
-is drawn as judges see it. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
+base configuration. Plans and datasets hold the shape that judges see, and no meshes: --problem names the file that
+leads to them. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
 """
 
 
@@ -26,6 +26,8 @@ def add(commands: "Commands[Parser]") -> None:
     option("what", metavar="PROBLEM|DIR|FILE", help="a problem, by name or file; the folder of a dataset; or plans")
     option("--row", metavar="I", type=values.natural, help="which plan of the file, or row of the split (default: 0)")
     option("--split", metavar="NAME", help="which split of the folder (default: validation)")
+    text = "the problem of plans or rows, whose URDF leads to its visual meshes"
+    option("--problem", metavar="NAME|FILE", help=text)
     option("-o", "--out", metavar="OUT", type=_page, help="where to (default: NAME.html here)")
 
 
@@ -48,38 +50,58 @@ def run(arguments: argparse.Namespace) -> int:
 def _scene(arguments: argparse.Namespace) -> "Scene":
     """Show what was given, by what it is."""
     from cnpgen.cli.view.scene import scene_of_plan, scene_of_problem
-    from cnpgen.errors import UsageError
     from cnpgen.plans import open_problem
     from cnpgen.problems.load import load_problem_behind
     from cnpgen.problems.robot import load_robot
     from cnpgen.store.paths import file_kind
 
     what, row = Path(arguments.what), arguments.row or 0
-    if arguments.split and not what.is_dir():
-        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
     if not what.is_dir() and not file_kind(what):
-        if arguments.row is not None:
-            raise UsageError(f"--row is for plans and for the folder of a dataset, got {arguments.what}")
+        _refuse_for_problem(arguments)
         problem = load_problem_behind(arguments.what)
         return scene_of_problem(problem, load_robot(problem))
-    plans = _row(arguments, row) if what.is_dir() else _plan(what, row)
-    problem, robot = open_problem(plans.problem)
-    return scene_of_plan(
-        problem, robot, plans, f"{problem.name}: {what.name}, {'row' if what.is_dir() else 'plan'} {row}"
-    )
+    plans, noun = (_row(arguments, row), "row") if what.is_dir() else (_plan(arguments, row), "plan")
+    if arguments.problem:
+        problem = load_problem_behind(arguments.problem)
+        robot = load_robot(problem)
+    else:
+        problem, robot = open_problem(plans.problem)
+    title = f"{problem.name}: {what.name}, {noun} {row}"
+    return scene_of_plan(problem, robot, plans, title, with_meshes=bool(arguments.problem))
+
+
+def _refuse_for_problem(arguments: argparse.Namespace) -> None:
+    """Refuse options that mean nothing for a problem."""
+    from cnpgen.errors import UsageError
+
+    given = [name for name in ("row", "split", "problem") if getattr(arguments, name) is not None]
+    if given:
+        raise UsageError(f"--{given[0]} is for plans and for the folder of a dataset, got {arguments.what}")
 
 
 def _row(arguments: argparse.Namespace, row: int) -> "Plans":
+    """Read a row of a dataset."""
+    from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
+    from cnpgen.problems.load import load_problem_behind
+    from cnpgen.problems.record import record_problem
 
-    return load_boundary_problems(arguments.what, split=arguments.split or "validation", start=row, n=1)
+    plans = load_boundary_problems(arguments.what, split=arguments.split or "validation", start=row, n=1)
+    if arguments.problem:
+        wanted = record_problem(load_problem_behind(arguments.problem))
+        if where := plans.problem.differences(wanted):
+            raise DatasetError(f"{arguments.what} is not of {wanted.name!r}: they differ in {', '.join(where)}")
+    return plans
 
 
-def _plan(file: Path, row: int) -> "Plans":
+def _plan(arguments: argparse.Namespace, row: int) -> "Plans":
+    """Read a plan."""
     from cnpgen.cli.plan_files import read_plans
     from cnpgen.errors import UsageError
 
-    plans = read_plans(file)
+    if arguments.split:
+        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
+    plans = read_plans(Path(arguments.what), problem=arguments.problem)
     if row >= len(plans):
-        raise UsageError(f"--row: {file} has no plan {row}: {len(plans)} plans are numbered from 0")
+        raise UsageError(f"--row: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")
     return plans[row : row + 1]

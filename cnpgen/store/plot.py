@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 SHOWN = 300  # rows in the picture from above
+ENOUGH = 25  # draws per cell of a map: shares of fewer say little
 ARROW = 0.05  # s: goal velocities are drawn as what they cover in this time
 
 _COLOURS = {"start": "tab:blue", "goal": "tab:red"}
@@ -102,6 +103,7 @@ def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:
     maps = inspection.fates.densities
     axes = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
     _draw_motions(axes[0], _some_rows(inspection))
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, loc="outside lower left", ncols=2)
     for axis, (name, density) in zip(axes[1:], maps.items(), strict=True):
         _draw_acceptance(figure, axis, name, density)
     for axis in axes:
@@ -131,16 +133,29 @@ def _draw_motions(axis: "Axes", rows: dict[str, NDArray[Any]]) -> None:
         axis.quiver(x, y, way * np.cos(angle), way * np.sin(angle), color=_COLOURS["goal"], **arrows)
     meaning = f", arrows: goal velocity x {1e3 * ARROW:g} ms" if "hit_speed" in rows else ""
     axis.set_title(f"{len(rows['goal_xyz'])} rows from above{meaning}", fontsize=9)
-    axis.legend(fontsize=7, loc="upper left")
 
 
 def _draw_acceptance(figure: "SubFigure", axis: "Axes", name: str, density: DensityMap) -> None:
-    """Draw the share of accepted draws per cell; cells without draws stay white."""
-    share = np.where(density.drawn > 0, density.accepted / np.maximum(density.drawn, 1), np.nan)
+    """Draw the share of accepted draws per cell; cells with hardly a draw stay white."""
+    drawn, accepted = _coarsened(density)
+    share = np.where(drawn >= ENOUGH / 5, accepted / np.maximum(drawn, 1), np.nan)
     extent = (*_widened(*density.x), *_widened(*density.y))
     picture = axis.imshow(share.T, origin="lower", extent=extent, vmin=0, cmap="viridis")
-    axis.set_title(f"share of draws accepted, by {name}", fontsize=9)
+    axis.set_title(f"share of draws accepted, by {name}\n{drawn.mean():,.0f} draws per cell", fontsize=9)
     figure.colorbar(picture, ax=axis, shrink=0.8).ax.tick_params(labelsize=7)
+
+
+def _coarsened(density: DensityMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return draws, and accepted ones, per cell of the finest grid whose cells have enough of them on the average."""
+    cells = min(density.drawn.shape)
+    joined = next((k for k in range(1, cells) if cells % k == 0 and _joined(density.drawn, k).mean() >= ENOUGH), cells)
+    return _joined(density.drawn, joined), _joined(density.accepted, joined)
+
+
+def _joined(counts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
+    """Add up k by k cells."""
+    nx, ny = counts.shape
+    return np.asarray(counts.reshape(nx // k, k, ny // k, k).sum(axis=(1, 3)))
 
 
 def _widened(low: float, high: float) -> tuple[float, float]:

@@ -53,7 +53,7 @@ def _draw_loss(axis: "Axes", steps: list[dict[str, Any]]) -> None:
     axis.plot(seconds, [record["terms"]["time"] for record in steps], label="task loss alone")
     axis.set_ylabel("loss [s]")
     axis.set_yscale("log")
-    axis.legend()
+    _name_lines(axis)
 
 
 def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
@@ -65,7 +65,7 @@ def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
             axis.axhline(budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8)
     axis.set_ylabel("terms (dashed: budgets)")
     axis.set_yscale("log")
-    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)  # beside the curves
+    _name_lines(axis)
 
 
 def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
@@ -74,7 +74,12 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
         axis.plot(seconds, [100 * record["validation"][name] for record in checks], marker=".", label=label)
     axis.set_ylabel("valid plans [%]")
     axis.set_ylim(0, 101)
-    axis.legend(loc="lower right")
+    _name_lines(axis)
+
+
+def _name_lines(axis: "Axes") -> None:
+    """Draw a legend above the curves, where it covers none of them."""
+    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
 
 def _draw_times(axis: "Axes", checks: list[dict[str, Any]]) -> None:

@@ -191,7 +191,8 @@ def test_a_line_is_a_tube_round_its_points():
     ("words", "said"),
     [
         (["airhockey", "--row", "1"], "--row is for plans and for the folder of a dataset, got airhockey"),
-        (["airhockey", "--split", "train"], "--split is for the folder of a dataset, got airhockey"),
+        (["airhockey", "--split", "train"], "--split is for plans and for the folder of a dataset, got airhockey"),
+        (["airhockey", "--problem", "airhockey"], "--problem is for plans and for the folder of a dataset"),
         (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
         (["airhokey"], "unknown problem, pipeline or dataset 'airhokey' (did you mean 'airhockey'?)"),
     ],
@@ -199,6 +200,31 @@ def test_a_line_is_a_tube_round_its_points():
 def test_what_cannot_be_meant_is_refused(words, said, capsys):
     assert main(["view", *words]) == 2
     assert said in capsys.readouterr().err
+
+
+@needs_meshcat
+def test_a_plan_is_shown_with_meshes_where_its_problem_is_named(tmp_path, capsys):
+    file = _with_visual(tmp_path, "package://crane/meshes/wedge.stl")
+    base, still = load_robot(load_problem(file)).base[None], np.zeros((1, 4))
+    boundary = cnpgen.Boundary(base, still, still, base, still)
+    points, rate = np.tile(base, (1, 15, 1)), np.ones((1, 20))
+    plans = cnpgen.make_plans(str(file), boundary, path_control_points=points, rate_control_points=rate)
+    cnpgen.save_plans(tmp_path / "plans.h5", plans)
+    page = tmp_path / "plan.html"
+    assert main(["view", str(tmp_path / "plans.h5"), "-o", str(page)]) == 0
+    assert len(content(page)["robot"]) > 3  # the pieces: what a file from elsewhere names is not read
+    assert main(["view", str(tmp_path / "plans.h5"), "--problem", str(file), "-o", str(page)]) == 0
+    assert [body["name"] for body in content(page)["robot"]] == ["fore"]
+    assert main(["view", str(tmp_path / "plans.h5"), "--problem", "airhockey", "-o", str(page)]) == 1
+    assert "not of 'airhockey'" in capsys.readouterr().err
+
+
+@needs_meshcat
+def test_a_row_is_not_shown_with_another_problem(plans, tmp_path, capsys):
+    rows, page = str(plans.with_name("rows")), str(tmp_path / "row.html")
+    assert main(["view", rows, "--problem", "heavy-object", "-o", page]) == 0
+    assert main(["view", rows, "--problem", "airhockey", "-o", page]) == 1
+    assert "is not of 'airhockey': they differ in" in capsys.readouterr().err
 
 
 def test_a_plan_that_is_not_there_is_refused(plans, capsys):

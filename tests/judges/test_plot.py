@@ -12,9 +12,13 @@ from matplotlib.figure import Figure
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.judges.plans.plot import plot_plan
+from cnpgen.problems.load import load_problem
+from cnpgen.problems.robot import load_robot
 from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.trajectory.motion import Motion
 from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import Plan, bent, course, load
+from tests.examples.shaped_robot import write_problem
 
 again = pytest.mark.extended  # the same claim, with the other of two plans
 
@@ -105,6 +109,48 @@ def test_a_transport_is_drawn_from_the_side_and_from_above(drawn):
     for view, (across, up) in (("side view", (1, 2)), ("top view", (1, 0))):
         goal = next(line for line in axes[view].get_lines() if line.get_label() == "goal")
         np.testing.assert_allclose(np.ravel(goal.get_data()), seen.tip[-1, [across, up]], atol=1e-9)
+
+
+def test_the_arm_of_a_transport_is_as_wide_as_its_capsules(drawn):
+    plan = load("transport")
+    draw(plan, Path("plan.png"))
+    for view in ("side view", "top view"):
+        areas = axes_of(drawn[0])[view].collections
+        assert len(areas) == 7 * len(plan.robot.skeleton)
+        for area in areas:
+            points = area.get_paths()[0].vertices
+            inside = 2 * 0.14 * np.cos(np.pi / 32)
+            assert np.ptp(points, axis=0).min() >= inside  # a circle of 14 cm at either end
+
+
+def test_the_arm_of_a_shape_is_drawn_by_its_pieces(drawn, tmp_path):
+    problem = load_problem(write_problem(tmp_path))
+    robot = load_robot(problem)
+    path, rate = np.tile(robot.base, (1, 15, 1)), np.ones((1, 20))
+    path[0, 7] += 0.3
+    plot_plan(problem, robot, Motion(path, rate, 7), 0, Path("plan.png"))
+    areas = axes_of(drawn[0])["top view"].collections
+    assert len(areas) == 7 * len(robot.shape.pieces)
+    base = areas[0].get_paths()[0].vertices
+    np.testing.assert_allclose([base.min(axis=0), base.max(axis=0)], [[-0.15, -0.15], [0.15, 0.15]], atol=1e-9)
+
+
+@pytest.mark.parametrize("label", ["hit", "transport"])
+def test_legends_are_whole_and_cover_nothing(label, drawn):
+    plan = load(label)
+    long = replace(plan.robot, joint_names=tuple(f"a_rather_long_name_of_joint_{i}" for i in range(plan.robot.n)))
+    vars(long).update(model=plan.robot.model)  # whose joints are called as before
+    plot_plan(plan.problem, long, plan.motion, 0, Path("plan.png"))
+    figure = drawn[0]
+    figure.draw_without_rendering()
+    axes = [axis.get_window_extent() for part in figure.subfigs for axis in part.axes]
+    legends = [legend.get_window_extent() for part in figure.subfigs for legend in part.legends]
+    assert len(legends) == 2
+    for legend in legends:
+        assert figure.bbox.x0 <= legend.x0 < legend.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= legend.y0 < legend.y1 <= figure.bbox.y1
+        assert not any(legend.overlaps(axis) for axis in axes)
+    assert not any(axis.get_legend() for part in figure.subfigs for axis in part.axes)
 
 
 def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_is_told(drawn):

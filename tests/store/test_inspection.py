@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.store.fates import DensityMap, Fates
 from cnpgen.store.inspection import inspect_dataset
-from cnpgen.store.plot import plot_dataset
+from cnpgen.store.plot import ENOUGH, plot_dataset
 from cnpgen.store.reader import open_dataset
 from tests.conftest import some
 
@@ -167,6 +168,30 @@ def test_nothing_to_draw_is_said(unfinished, tmp_path):
     (unfinished / "train" / "shard-00000.json").unlink()
     with pytest.raises(DatasetError, match="no rows yet"):
         plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
+
+
+@pytest.mark.parametrize(("draws", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
+def test_cells_of_a_map_hold_enough_draws_to_say_something(draws, cells, hits, tmp_path, monkeypatch):
+    random = np.random.default_rng(0)
+    drawn = np.bincount(random.integers(0, 24 * 24, draws), minlength=24 * 24).reshape(24, 24)
+    accepted = random.binomial(drawn, 0.5)
+    accepted[:12] = 0  # none of the lower half of x
+    density = DensityMap((0.0, 1.0), (0.0, 1.0), drawn, accepted)
+    found = inspect_dataset(hits)
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.append(self))
+    monkeypatch.setitem(vars(found.summary), "fates", Fates(tried=0, accepted=0, densities={"start_xyz": density}))
+    plot_dataset(found, tmp_path / "map.png")
+    (picture,) = (image for part in figures[0].subfigs for axis in part.axes for image in axis.get_images())
+    share = picture.get_array().T
+    assert share.shape == (cells, cells)
+    assert draws / cells**2 >= ENOUGH
+    np.testing.assert_array_equal(share[: cells // 2].compressed(), 0)
+    assert share[cells // 2 :].mean() == pytest.approx(0.5, abs=0.1)
+    (legend,) = (legend for part in figures[0].subfigs for legend in part.legends)
+    figures[0].draw_without_rendering()
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axis.get_window_extent()) for part in figures[0].subfigs for axis in part.axes)
 
 
 def test_missing_matplotlib_is_a_hint_and_not_a_traceback(hits, tmp_path, monkeypatch):

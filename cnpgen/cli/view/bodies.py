@@ -16,7 +16,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.files import find_named_file
-from cnpgen.robots.shape.inline import scale_of
+from cnpgen.robots.shape.inline import read_mesh, scale_of
 from cnpgen.robots.shape.piece import origin_of, piece_of
 from cnpgen.robots.urdf import urdf_tree
 
@@ -47,10 +47,17 @@ class Body:
     triangles: NDArray[np.integer[Any]]
 
 
-def robot_bodies(problem: Problem, robot: Robot) -> tuple[list[Body], str]:
-    """Return the bodies of a robot, and what they are: "meshes", "pieces" or "line"."""
+def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
+    """Return the bodies of a robot, and what they are: "meshes", "pieces" or "line".
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        with_meshes: Whether the visual meshes that its URDF names are read, if they are there; those that a file from
+            elsewhere names had better not be.
+    """
     try:
-        visual = list(_visual_bodies(problem, robot))
+        visual = list(_visual_bodies(problem, robot)) if with_meshes else []
     except (RecipeError, ValueError):  # a mesh is not there, or is none: judges do not need it
         visual = []
     if visual and sum(len(body.triangles) for body in visual) <= MOST_TRIANGLES:
@@ -138,17 +145,11 @@ def _visual(
         piece = piece_of(link, element)
         body = wrapped(link, 0, piece.vertices, piece.radius)
         return body.corners, body.triangles
-    import coal
-
     rotation, translation = origin_of(element.find("origin"))
-    path = find_named_file(mesh.get("filename", ""), urdf, packages)
-    try:
-        loaded = coal.MeshLoader().load(str(path), scale_of(mesh))
-    except RuntimeError as error:
-        raise RecipeError([f"{path}: not a mesh that can be read: {error}"]) from error
+    points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), urdf, packages), scale_of(mesh))
     sides = [loaded.tri_indices(number) for number in range(loaded.num_tris)]
     triangles = np.array([(side[0], side[1], side[2]) for side in sides], np.int64).reshape(-1, 3)
-    return np.array(loaded.vertices(), float) @ rotation.T + translation, triangles
+    return points @ rotation.T + translation, triangles
 
 
 def _placed(placement: "pin.SE3", points: Array) -> Array:

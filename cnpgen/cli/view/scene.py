@@ -59,22 +59,31 @@ class Scene:
 def scene_of_problem(problem: Problem, robot: Robot) -> Scene:
     """Show a robot in its base configuration."""
     q = robot.base[:, None]
-    return _scene(problem, robot, f"{problem.name}: base configuration", q, moments=("base",), times=np.zeros(1))
+    title, bodies = f"{problem.name}: base configuration", robot_bodies(problem, robot)
+    return _scene(problem, robot, title, q, bodies, moments=("base",), times=np.zeros(1))
 
 
-def scene_of_plan(problem: Problem, robot: Robot, plans: Plans, title: str) -> Scene:
+def scene_of_plan(problem: Problem, robot: Robot, plans: Plans, title: str, *, with_meshes: bool) -> Scene:
     """Show the motion of one plan or, of a row without a plan, its start and its goal.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        plans: The plan.
+        title: What the page is called.
+        with_meshes: Whether the URDF's visual meshes are read.
 
     Raises:
         UsageError: The plan has no course that could be drawn.
     """
+    bodies = robot_bodies(problem, robot, with_meshes=with_meshes)
     if not np.isfinite(plans.duration[0]):
         boundary = plans.boundary
         q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
-        return _scene(problem, robot, title, q, moments=("start", "goal"), times=np.arange(2.0))
+        return _scene(problem, robot, title, q, bodies, moments=("start", "goal"), times=np.arange(2.0))
     world, _, times = along(problem, robot, plans.motion, 0, samples=MOMENTS)
     moments = tuple(f"{time:.3f} s" for time in times)
-    return _scene(problem, robot, title, world.q, moments=moments, times=times, shares=shares_of_limits(world))
+    return _scene(problem, robot, title, world.q, bodies, moments=moments, times=times, shares=shares_of_limits(world))
 
 
 def _scene(
@@ -82,6 +91,7 @@ def _scene(
     robot: Robot,
     title: str,
     q: Array,
+    bodies: tuple[list[Body], str],
     *,
     moments: tuple[str, ...],
     times: Array,
@@ -89,15 +99,14 @@ def _scene(
 ) -> Scene:
     poses = _poses(robot, q)
     tip = poses[:, -1, :3, 3]
-    bodies, kind = robot_bodies(problem, robot)
     size = problem.object_size
     return Scene(
         title=title,
         moments=moments,
         times=times,
         poses=poses,
-        robot=tuple(bodies),
-        kind=kind,
+        robot=tuple(bodies[0]),
+        kind=bodies[1],
         capsules=tuple(capsule_bodies(robot)),
         world=tuple(_world(problem, obstacle_tops(problem, tip[0], tip[-1]))),
         path=(tube("path of the tip", tip, LINE),) if shares else (),

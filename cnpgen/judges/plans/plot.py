@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
@@ -15,6 +16,7 @@ from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
+from cnpgen.world.trace import trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +28,7 @@ Array = NDArray[np.float64]
 
 SAMPLES = 1000
 SHOWN = 7  # moments at which the arm and the object are drawn
+LEGEND = 115  # letters that fit side by side over the curves
 _START, _BETWEEN, _GOAL, _LIMIT, _BOX = "tab:blue", "0.55", "tab:red", "0.25", "0.85"
 
 
@@ -74,6 +77,8 @@ def plot_plan(
         _draw_views(tip, problem, world, tops)
     else:
         _draw_over_table(tip, table, world, s, t)
+    named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
     try:
         figure.savefig(path)
     except OSError as error:
@@ -136,7 +141,9 @@ def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
         axis.set_ylabel(f"{name} [% of limit]", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     axes[-1].set_xlim(t[0], t[-1])
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=robot.n, fontsize=8)
+    columns = max(1, LEGEND // (max(map(len, robot.joint_names)) + 8))  # a line, and room between entries
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(robot.n, columns), fontsize=8)
 
 
 def _draw_limits(axis: "Axes", largest: float) -> None:
@@ -166,35 +173,71 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
     beside.fill_between(t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="called valid")
     beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
     beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
-    beside.legend(fontsize=8)
     beside.grid(color="0.9", linewidth=0.6)
 
 
 def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, tops: Array) -> None:
-    """Draw arm, object and obstacles from the side (y-z) and from above (x-y)."""
-    solids = solids_of(problem.obstacle, tops)
-    segments, corners = world.segments(), world.object_corners() if problem.object else None
+    """Draw arm, object and obstacles from the side, across which the tip moves most, and from above."""
+    solids, corners = solids_of(problem.obstacle, tops), world.object_corners() if problem.object else None
+    side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
     colours = [_BETWEEN] * (SHOWN - 2) + [_START, _GOAL]
     moments = np.linspace(0, world.q.shape[1] - 1, SHOWN).round().astype(int)
     moments = np.concatenate([moments[1:-1], moments[[0, -1]]])  # the ends are drawn last, on top
-    for axis, (across, up), title in zip(figure.subplots(2, 1), ((1, 2), (1, 0)), ("side", "top"), strict=True):
+    links = [_links(problem, world, k) for k in moments]
+    for axis, (across, up), title in zip(figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True):
         for solid in solids:
             _draw_solid(axis, solid, (across, up))
-        for k, colour in zip(moments, colours, strict=True):
-            _draw_body(axis, segments[..., k], None if corners is None else corners[..., k], (across, up), colour)
+        for k, points, colour in zip(moments, links, colours, strict=True):
+            _draw_body(axis, points, None if corners is None else corners[..., k], (across, up), colour)
         _draw_course(axis, world.tip_position[across], world.tip_position[up])
         axis.set_aspect("equal")
         axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]", title=f"{title} view")
         axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
 
 
-def _draw_body(axis: "Axes", segments: Array, corners: Array | None, plane: tuple[int, int], colour: str) -> None:
-    """Draw the arm's skeleton and the outline of what it holds, at one moment."""
-    style: dict[str, Any] = {"color": colour, "linewidth": 0.8 if colour == _BETWEEN else 1.6, "alpha": 0.8}
-    for segment in segments[:, :, list(plane)]:
-        axis.plot(*segment.T, "-o", markersize=3, **style)
+def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, float]]:
+    """Return the links at one moment: corners of a hull in the world [m], shape (V, 3), and its thickness [m].
+
+    They are the pieces of the robot's shape, or the segments of its skeleton, as thick as a constraint says.
+    """
+    robot = world.robot
+    if robot.shape is None:
+        radius = next((each.radius for each in problem.constraint if isinstance(each, RobotClearance)), None)
+        return [(segment, radius or 0.0) for segment in world.segments()[..., k]]
+    joints = list(range(robot.n + 1))
+    rotations, positions = trace(
+        robot.model, robot.model.createData(), world.q[:, k : k + 1], joints, n_turned=robot.n + 1
+    )
+    places = ((piece, robot.shape.joints[piece.link]) for piece in robot.shape.pieces)
+    return [
+        (piece.vertices @ rotations[joint, :, :, 0].T + positions[joint, :, 0], piece.radius) for piece, joint in places
+    ]
+
+
+def _draw_body(
+    axis: "Axes", links: list[tuple[Array, float]], corners: Array | None, plane: tuple[int, int], colour: str
+) -> None:
+    """Draw the outlines of the arm's links and of what it holds, at one moment."""
+    from matplotlib.collections import PolyCollection
+
+    between = colour == _BETWEEN
+    style: dict[str, Any] = {"color": colour, "linewidth": 0.5 if between else 1.2, "alpha": 0.5 if between else 0.9}
+    for points, radius in links:
+        outline = _outline(points[:, list(plane)], radius)
+        axis.plot(*outline.T, **style)
+        area = PolyCollection([outline], facecolors=colour, alpha=0.03 if between else 0.12, linewidths=0)
+        axis.add_collection(area)
     if corners is not None:
-        axis.plot(*_hull(corners[:, list(plane)]).T, **style)
+        axis.plot(*_hull(corners[:, list(plane)]).T, **style | {"linewidth": 2 * style["linewidth"]})
+
+
+def _outline(points: Array, radius: float) -> Array:
+    """Outline of the hull of points in the plane, as thick as a radius says, shape (V, 2) -> (m, 2)."""
+    if not radius:
+        return points if len(points) == 2 else _hull(points)
+    angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return _hull((points[:, None] + circle).reshape(-1, 2))
 
 
 def _hull(points: Array) -> Array:
@@ -209,17 +252,13 @@ def _draw_course(axis: "Axes", a: Array, b: Array) -> None:
     axis.plot(a, b, color="black", linewidth=1.4)
     axis.plot(a[0], b[0], "o", color=_START, label="start")
     axis.plot(a[-1], b[-1], "s", color=_GOAL, label="goal")
-    axis.legend(fontsize=8, loc="best")
 
 
 def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
     """Draw the shadow of an obstacle."""
     from matplotlib.patches import Polygon
 
-    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    round_it = solid.radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    shadow = (solid.position + solid.corners)[:, None, list(plane)] + round_it
-    outline = _hull(shadow.reshape(-1, 2))
+    outline = _outline((solid.position + solid.corners)[:, list(plane)], solid.radius)
     axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
     axis.update_datalim(outline)
 

@@ -6,6 +6,7 @@ A plan, a dataset or a planner carries its problem as text; so the shape of the 
 import base64
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,6 +16,9 @@ from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.files import find_named_file
 from cnpgen.robots.shape.hull import FARTHEST, hull_corners
 from cnpgen.robots.urdf import urdf_tree
+
+if TYPE_CHECKING:
+    import coal
 
 Array = NDArray[np.float64]
 
@@ -131,7 +135,26 @@ def scale_of(mesh: ElementTree.Element) -> Array:
 
 
 def _hull_of_file(path: Path, scale: Array) -> Array:
-    """Read a mesh and return the corners of its convex hull [m]."""
+    """Return the corners of the convex hull of a mesh [m]."""
+    points = read_mesh(path, scale)[0]
+    if not len(points) or not (np.abs(points) <= FARTHEST).all():
+        raise RecipeError([f"{path}: the mesh has no points, or some further off than {FARTHEST:,.0f} m"])
+    return hull_corners(points)
+
+
+def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
+    """Read a mesh: STL, DAE or OBJ.
+
+    Args:
+        path: The file.
+        scale: Factors of its x, y and z, shape (3,).
+
+    Returns:
+        Its points [m], shape (N, 3), and the mesh as Coal has it.
+
+    Raises:
+        RecipeError: It cannot be read.
+    """
     import coal
 
     if path.suffix.lower() not in _MESHES:
@@ -139,10 +162,8 @@ def _hull_of_file(path: Path, scale: Array) -> Array:
     if (size := path.stat().st_size) > MOST_MESH_BYTES:
         raise RecipeError([f"{path}: has {size:,} bytes, expected a mesh of at most {MOST_MESH_BYTES:,}"])
     try:
-        points = np.array(coal.MeshLoader().load(str(path), scale).vertices(), float).reshape(-1, 3)
+        mesh = coal.MeshLoader().load(str(path), scale)
+        return np.array(mesh.vertices(), float).reshape(-1, 3), mesh
     except (ValueError, RuntimeError, MemoryError) as error:
         said = [line for line in str(error).splitlines() if not line.startswith("Hint:")]
         raise RecipeError([f"{path}: not a mesh that can be read: {said[-1] if said else 'too large'}"]) from error
-    if not len(points) or not (np.abs(points) <= FARTHEST).all():
-        raise RecipeError([f"{path}: the mesh has no points, or some further off than {FARTHEST:,.0f} m"])
-    return hull_corners(points)
