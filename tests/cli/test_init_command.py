@@ -231,7 +231,7 @@ def test_a_tip_that_reaches_no_box_is_refused(tmp_path, capsys):
     pan_tilt = [("revolute", "0 0 1", LIMIT), ("revolute", "0 1 0", LIMIT)]
     urdf = write_arm(tmp_path / "arm.urdf", pan_tilt)
     said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
-    assert "does the tip reach 2%; choose another --tip" in said
+    assert "the tip reaches less than 2 % of every box of positions near" in said
 
 
 def test_files_that_are_there_are_written_over_only_by_force(tmp_path, capsys):

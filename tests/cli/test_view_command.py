@@ -105,6 +105,15 @@ def test_a_page_asks_no_network(page):
 
 
 @needs_meshcat
+def test_names_cannot_become_a_part_of_the_page(plans, tmp_path):
+    named = tmp_path / "<!--<script>alert(1)<b>.h5"
+    shutil.copy(plans, named)
+    assert main(["view", str(named), "-o", str(tmp_path / "page.html")]) == 0
+    assert "<script>alert" not in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert content(tmp_path / "page.html")["title"] == "heavy-object: <!--<script>alert(1)<b>.h5, plan 0"
+
+
+@needs_meshcat
 def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(plans, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     folder = plans.with_name("rows")

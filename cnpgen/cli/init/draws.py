@@ -115,7 +115,8 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
             break
     share, best = max(found, key=lambda each: each[0])
     if share < HARDLY:
-        text = f"of no box near ({', '.join(f'{each:.2f}' for each in middle)}) m does the tip reach {HARDLY:.0%}"
+        where = ", ".join(f"{each:.2f}" for each in middle)
+        text = f"the tip reaches less than {100 * HARDLY:g} % of every box of positions near ({where}) m"
         raise RecipeError([f"{robot.urdf}: {text}; choose another --tip, or copy a recipe and write its boxes by hand"])
     return best, share
 

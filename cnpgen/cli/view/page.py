@@ -28,7 +28,7 @@ def page_of(scene: Scene) -> str:
         MachineError: MeshCat is not installed.
     """
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    data = json.dumps(_content(scene), separators=(",", ":")).replace("</", "<\\/")
+    data = json.dumps(_content(scene), separators=(",", ":")).replace("<", "\\u003c")
     before, between = template.split("/*VIEWER*/")
     return before + _viewer() + between.replace("/*DATA*/", data)
 

@@ -34,9 +34,11 @@ class Scene:
         moments: What each of the K moments is called: its time, "start", "goal".
         times: The moments [s], shape (K,); those of states that no motion joins are 0, 1, ...
         poses: Where the joints are, the universe first and the tip last, shape (K, joints, 4, 4).
-        robot: Bodies of the robot, and what they are.
+        robot: Bodies of the robot.
+        kind: What they are: "meshes", "pieces" or "line".
         capsules: Capsules round its links.
-        world: Obstacles, the table, the path of the tip.
+        world: Obstacles, and the table.
+        path: The path of the tip, of a motion.
         held: The held object, in the tip's frame.
         joints: Names of the planned joints.
         shares: Quantity -> share of the limits, shape (n, K); nothing where there is no motion.
