@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # the corners of a cube of edge length 1 round the origin
-FARTHEST = 1e4  # m: whatever is further off is no part of a robot
 THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
+FARTHEST = 1e4  # m: whatever is further off is no part of a robot
 
 
 def check_solid(corners: Array) -> None:
