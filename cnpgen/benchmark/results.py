@@ -126,7 +126,7 @@ def _check_row(row: Any) -> None:
     check_form(row, {"problem": WHOLE})
     if "ending" in row:
         check_form(row, {**_PLANNED, "answer": Maybe({EVERY: ANYTHING})})
-        if answer := row["answer"]:
+        if (answer := row["answer"]) is not None:
             form = _PLAN if "degree" in answer else {**_NEEDED, **_present(_SAMPLES, answer)}
             check_form(answer, form)
             check_form(row, {"verdict": _VERDICT})

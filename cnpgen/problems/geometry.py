@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 from cnpgen.errors import RecipeError
 from cnpgen.problems.checks import named_packages, tables
 from cnpgen.robots.shape.files import find_named_file, find_urdf
-from cnpgen.robots.shape.inline import mesh_files
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import Place
 
@@ -72,7 +71,8 @@ def _missing_files(
         if not package.is_dir():
             yield (where / "packages").says(f"no such folder: {package}")
     urdf = find_urdf(str(robot.get("urdf")), folder / "problem.toml", packages) if elements else folder
-    for name in mesh_files(read_urdf(urdf)) if elements else ():
+    meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
+    for name in (each for each in meshes if not each.startswith("data:")):
         try:
             find_named_file(name, urdf, packages)
         except RecipeError as error:

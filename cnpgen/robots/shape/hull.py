@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # the corners of a cube of edge length 1 round the origin
-FARTHEST = 1e4  # m: whatever is further off is no part of a robot
 MOST_PLANES = 24  # that stand for the faces of a hull
 NEAR = math.cos(math.radians(3))  # of the angle between planes that are as good as one
 THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
+FARTHEST = 1e4  # m: whatever is further off is no part of a robot
 
 
 def check_solid(corners: Array) -> None:
