@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.judges.plans.plot import plot_plan
+from tests.examples.jerky import jerky_plan
 from tests.examples.plans import Plan, bent, course, load
 
 again = pytest.mark.extended  # the same claim, with the other of two plans
@@ -33,6 +34,19 @@ def axes_of(figure: Figure) -> dict[str, Any]:
     """Axes by the label of their y axis or their title."""
     axes = [axis for part in figure.subfigs for axis in part.axes]
     return {axis.get_title() or axis.get_ylabel(): axis for axis in axes}
+
+
+def test_jerks_are_drawn_where_they_are_limited(tmp_path: Path, drawn: list[Figure]) -> None:
+    plan = jerky_plan("hit")
+    draw(plan, tmp_path / "a.png")
+    draw(load("hit"), tmp_path / "b.png")
+    limited, free = (axes_of(figure) for figure in drawn)
+    assert "jerk [% of limit]" in limited
+    assert "jerk [% of limit]" not in free
+    seen = limited["jerk [% of limit]"].lines[0]
+    t = course(plan)
+    share = 100 * np.interp(seen.get_xdata(), t.t, t.jerk[:, 0]) / plan.robot.jerk_limit[0]
+    np.testing.assert_allclose(seen.get_ydata(), share, atol=0.01 * np.abs(share).max())
 
 
 @pytest.mark.parametrize(
