@@ -92,8 +92,7 @@ def describe_problem(problem: Problem) -> str:
             *table(facts, indent="  "),
             "",
             "  planning limits",
-            *table(_limit_rows(robot), indent="    "),
-            *([_jerk_limits(robot)] if problem.uses_jerk else []),
+            *table(_limit_rows(problem, robot), indent="    "),
             *_shape(robot),
             "",
             "  constraints",
@@ -127,19 +126,21 @@ def _shape(robot: Robot) -> list[str]:
     ]
 
 
-def _limit_rows(robot: Robot) -> list[tuple[str, ...]]:
-    head = ("joint", "position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]", "torque [N m]", "base [rad]")
-    columns = (robot.velocity_limit, robot.acceleration_limit, robot.torque_limit, robot.base)
-    ranges = zip(robot.position_lower, robot.position_upper, strict=True)
-    rows = zip(robot.joint_names, ranges, *columns, strict=True)
-    return [
-        head,
-        *((name, f"{low:.4g} to {high:.4g}", *(f"{x:.4g}" for x in rest)) for name, (low, high), *rest in rows),
+def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
+    """List what limits every joint; its jerk where the problem has something to say about jerks."""
+    ends = zip(robot.position_lower, robot.position_upper, strict=True)
+    columns = [
+        ("joint", "", robot.joint_names),
+        ("position", "[rad]", [f"{low:.4g} to {high:.4g}" for low, high in ends]),
+        ("velocity", "[rad/s]", [f"{x:.4g}" for x in robot.velocity_limit]),
+        ("acceleration", "[rad/s^2]", [f"{x:.4g}" for x in robot.acceleration_limit]),
+        ("jerk", "[rad/s^3]", [f"{x:.6g}" for x in robot.jerk_limit]),
+        ("torque", "[N m]", [f"{x:.4g}" for x in robot.torque_limit]),
+        ("base", "[rad]", [f"{x:.4g}" for x in robot.base]),
     ]
-
-
-def _jerk_limits(robot: Robot) -> str:
-    return f"    jerk [rad/s^3], joint by joint: {', '.join(f'{x:.4g}' for x in robot.jerk_limit)}"
+    spoken_of = problem.uses_jerk or problem.limits.jerk is not None
+    shown = [(name, unit, *cells) for name, unit, cells in columns if spoken_of or name != "jerk"]
+    return list(zip(*shown, strict=True))
 
 
 def title_lines(title: str) -> list[str]:

@@ -15,7 +15,7 @@ _LEFT_OUT = {
 
 def link_rows(shape: Shape) -> list[tuple[str, ...]]:
     """List the links: how many pieces and corners, and the capsule that covers them."""
-    head = ("link", "pieces", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "moved by joint")
+    head = ("link", "pieces", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "joint")
     rows: list[tuple[str, ...]] = [head]
     for capsule in shape.capsules:
         pieces = [piece for piece in shape.pieces if piece.link == capsule.link]

@@ -22,6 +22,7 @@ from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
 from tests.examples.example_robots import with_robots
+from tests.examples.jerky import jerky
 from tests.examples.shaped_robot import write_problem
 
 
@@ -78,9 +79,15 @@ def test_the_stages_are_numbered_in_order():
 
 def test_the_limits_of_every_joint_are_shown():
     text = describe(load_problem("airhockey"))
-    assert "velocity [rad/s]" in text
+    assert re.search(
+        r"joint +position +velocity +acceleration +torque +base\n +\[rad\] +\[rad/s\] +\[rad/s\^2\] ", text
+    )
     assert "-2.967 to 2.967" in text
     assert "11.87" in text
+    problem, robot = jerky("airhockey")
+    limited = describe(problem)
+    assert re.search(r"acceleration +jerk +torque", limited)
+    assert all(f" {limit:.6g} " in limited for limit in robot.jerk_limit)
 
 
 def test_an_object_and_obstacles_are_described():

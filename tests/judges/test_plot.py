@@ -16,6 +16,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.trajectory.motion import Motion
+from tests.examples.jerky import jerky_plan
 from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import Plan, bent, course, load
 from tests.examples.shaped_robot import write_problem
@@ -44,6 +45,19 @@ def axes_of(figure: Figure) -> dict[str, Any]:
 def shadow(patch: Any) -> Any:
     """The box round a patch."""
     return patch.get_path().get_extents(patch.get_patch_transform())
+
+
+def test_jerks_are_drawn_where_they_are_limited(tmp_path: Path, drawn: list[Figure]) -> None:
+    plan = jerky_plan("hit")
+    draw(plan, tmp_path / "a.png")
+    draw(load("hit"), tmp_path / "b.png")
+    limited, free = (axes_of(figure) for figure in drawn)
+    assert "jerk [% of limit]" in limited
+    assert "jerk [% of limit]" not in free
+    seen = limited["jerk [% of limit]"].lines[0]
+    t = course(plan)
+    share = 100 * np.interp(seen.get_xdata(), t.t, t.jerk[:, 0]) / plan.robot.jerk_limit[0]
+    np.testing.assert_allclose(seen.get_ydata(), share, atol=0.01 * np.abs(share).max())
 
 
 @pytest.mark.parametrize(
