@@ -14,7 +14,7 @@ between 0.05 and 0.95 of their time T, where they are, off the table by what pla
 Nothing was chosen by these seeds. The clock is CPU time, one BLAS thread. Goals stand beside the figures.
 
     python benchmarks/onthefly.py
-    python benchmarks/onthefly.py --full     # 1,000 problems of each set, all refined
+    python benchmarks/onthefly.py --problems 1000 --refined 1000
 """
 
 import argparse
@@ -51,7 +51,6 @@ GOALS = {  # share of valid plans, as the network gives them
     "today's rows": 0.96,
 }  # fmt: skip
 REFINED_VALID, OVER_REFINED, REFINE_MS, REFINE_P95_MS = 0.998, 1.08, 8.0, 15.0
-COUNT, SHORT = (1000, 1000), (300, 60)  # problems of a set, and how many of them are refined
 
 State = tuple[Any, Any, Any]
 
@@ -152,21 +151,21 @@ def rows_of(model: str, name: str, found: dict[str, float]) -> list[tuple[str, .
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument("--models", nargs="+", default=["airhockey-onthefly"], help="shipped ones or files")
-    parser.add_argument("--full", action="store_true", help="1,000 problems of each set, all of them refined")
+    parser.add_argument("--problems", type=int, default=300, help="of each set")
+    parser.add_argument("--refined", type=int, default=60, help="how many of them are refined")
     parser.add_argument("--seed", type=int, default=135_792_468, help="of the problems")
 
 
 def main() -> None:
     """Run."""
     chosen = arguments(__doc__, options)
-    count, refined = COUNT if chosen.full else SHORT
-    problems = sets(count, chosen.seed)
+    problems = sets(chosen.problems, chosen.seed)
     results: dict[str, Any] = {}
     for model in chosen.models:
         planner = Planner(model)
         for name, boundary in problems.items():
             progress(f"{model}: {name}")
-            results.setdefault(model, {})[name] = measure(planner, boundary, refined)
+            results.setdefault(model, {})[name] = measure(planner, boundary, chosen.refined)
     each = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
     rows = [row for model, name, found in each for row in rows_of(model, name, found)]
     head = ("planner", "problems", "figure", "value", "goal", "")

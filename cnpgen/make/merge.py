@@ -121,10 +121,11 @@ def _copy(folder: Path, out: Path, task: ShardTask, blueprint: Blueprint) -> Non
 def _shipped_notes(blueprint: Blueprint) -> str:
     """Return the data card of the shipped recipe that a dataset was made of; parts of other recipes hold none."""
     known: Mapping[str, Path] = list_recipes("dataset")
+    model = blueprint.stages[-1].get("model")
     for name in known:
-        with suppress(RecipeError):
+        with suppress(RecipeError, UsageError):
             recipe = load_dataset_recipe(name)
-            for each in (recipe, certified(recipe)):
+            for each in (recipe, certified(recipe, model=model)):
                 if each.name == blueprint.name and recipe_digest(each) == blueprint.recipe_sha256:
                     return load_notes(each)
     return ""

@@ -30,6 +30,7 @@ class StartOnPlan(Stage):
     """Plans the draws so far and moves their starts to random moments of the motions, put back on the table exactly."""
 
     needs = (*BOUNDARY, "start_xyz", *GOAL[2:-1])
+    renews = ("goal_q", "goal_dq")
     model: str = field("the planner: name of a shipped one, or path of a model file")
     sha256: str = field("sha256 of the model's file: from another one come other rows", pattern=SHA256)
     moved: float = field("fraction of the starts that are moved; the others stay where they are", low=0.0, high=1.0)

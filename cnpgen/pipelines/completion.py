@@ -50,7 +50,7 @@ class Completion:
         written = written_columns(pipeline.path, steps, context)
         with context.kernels.compiling_together():
             self._tip = context.kernels.load(tip_position)
-            self._stages = _completing(steps, context, known)
+            self._stages = _completing(_of_tasks(steps, context), context, known)
             self._accept = acceptance(context, written, given=_given_ends(given))
         self._random = np.random.default_rng(0)  # of plug-ins that draw past their round
 
@@ -138,6 +138,16 @@ def _given_ends(given: Collection[str]) -> list[End]:
     """List the ends of which joint states are given; those of which only the position is are solved for exactly."""
     ends: tuple[End, ...] = ("start", "goal")
     return [end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & set(given)]
+
+
+def _of_tasks(steps: Iterable[Step], context: Context) -> list[Step]:
+    """Leave out the stages that find or use, before a stage that renews them, what tasks need only after it."""
+    left: list[Step] = []
+    for step in steps:
+        renewed = set(step.stage.renews)
+        left = [each for each in left if not renewed & {*each.stage.needs, *each.stage.writes(context)}]
+        left.append(step)
+    return left
 
 
 def _completing(steps: Iterable[Step], context: Context, known: Collection[str]) -> list[tuple[str, Work]]:

@@ -47,7 +47,7 @@ class Omega:
         path_scale: What phi is a multiple of [rad]; pi in the paper.
         bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps that bend the path.
-        expected_time: What rates are multiples of the inverse of: "distance", as in the paper, or "reach": ``Meaning``.
+        expected_time: What rates are multiples of the inverse of: "distance" as in the paper, or "reach" (``Meaning``).
         backend: Which kernels run; by default the fastest that works here.
         cache_folder: Where kernels are kept; by default where all are.
 

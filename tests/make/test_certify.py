@@ -16,6 +16,7 @@ from cnpgen.judges.rows.plans import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.merge import _shipped_notes
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems, plans_of_rows
@@ -156,6 +157,7 @@ def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
     assert (stage["use"], stage["model"], stage["sha256"]) == (
         "certified-plan", "airhockey-hit", file_sha256(shipped_models()["airhockey-hit"]),
     )  # fmt: skip
+    assert _shipped_notes(open_dataset(from_planner).blueprint).startswith("Hits from rest")
     one, other = (open_dataset(each).read("train") for each in (folder, from_planner))
     np.testing.assert_array_equal(one["start_q"], other["start_q"])
     assert (one["path_control_points"] != other["path_control_points"]).any()

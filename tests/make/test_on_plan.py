@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
+from cnpgen.kernels.library import choose_backend
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.complete import complete
+from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.on_plan import GOAL, MOMENTS, GoalOfPlan, StartOnPlan, of_plan
 from cnpgen.make.stage_planner import load_stage_planner, model_sha256
+from cnpgen.pipelines.completion import Completion
+from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.prepared import random_generator
 from cnpgen.pipelines.stages.stage import Round
 from cnpgen.planner.planner import Planner, states_at
@@ -116,3 +120,12 @@ def test_tasks_keep_their_start_and_their_goal() -> None:
     np.testing.assert_array_equal(other.plans.boundary.start_q, old.boundary.start_q)
     same = np.isin(other.plans.sample_id, one.plans.sample_id)
     np.testing.assert_allclose(other.plans.boundary.goal_q[same], one.plans.boundary.goal_q, atol=1e-12)
+
+
+def test_of_the_first_hit_tasks_need_nothing() -> None:
+    pipeline = load_dataset_recipe("airhockey-onthefly").pipeline
+    completion = Completion(pipeline, load_context(pipeline.problem, *choose_backend(None)), ["goal_xyz", "hit_angle"])
+    labels = [label for label, _ in completion._stages]
+    assert "5. hitting-configuration" not in labels
+    assert "7. braking-reach" not in labels
+    assert {"2. start-ik", "3. table-velocity", "13. hitting-configuration", "16. braking-reach"} <= set(labels)

@@ -85,9 +85,11 @@ class Stage(ABC):
 
     Attributes:
         block_rows: The largest blocks that rows may be made in; a stage that takes long for a row says less.
+        renews: Columns that later stages find anew. Stages before this one that find or use them do nothing for tasks.
     """
 
     block_rows: ClassVar[int] = BLOCK_ROWS
+    renews: ClassVar[tuple[str, ...]] = ()
 
     @property
     def tasks(self) -> int | None:
