@@ -11,6 +11,7 @@ from scipy.optimize import LinearConstraint, minimize
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
+from cnpgen.benchmark.planners.boxes import boxes_of
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.sst import Tree
@@ -21,6 +22,7 @@ from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem
+from cnpgen.robots.obstacle import Obstacle
 
 
 def one_of(suite: str, index: int = 0) -> Plans:
@@ -188,3 +190,10 @@ def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal(monkeypatch
     step = np.diff(found.q, axis=0) - np.diff(found.t)[:, None] * (found.dq[1:] + found.dq[:-1]) / 2
     assert np.abs(step).max() < 1e-12  # accelerations are constant over every step
     np.testing.assert_array_equal(found.q[0], task.boundary.start_q[0])
+
+
+def test_baselines_know_upright_boxes_only() -> None:
+    problem, _ = open_problem(one_of("heavy-100").problem)
+    ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
+    with pytest.raises(UsageError, match="it knows upright boxes only, and 'heavy-object' has ball"):
+        boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), np.zeros(3), np.zeros(3))

@@ -26,6 +26,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
+from tests.examples.shaped_robot import KINDS as EVERY_KIND
 from tests.examples.shaped_robot import write_problem
 
 KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
@@ -93,6 +94,14 @@ def test_an_object_and_obstacles_are_described():
     text = describe(load_problem("heavy-object"))
     assert "(0.2, 0.2, 0.3) m" in text
     assert "pedestal-2: x [0.2, 0.6] m" in text
+
+
+def test_obstacles_of_every_kind_are_described_by_what_is_theirs(tmp_path):
+    text = describe(load_problem(write_problem(tmp_path, obstacles=EVERY_KIND)))
+    assert "ball: kind sphere, position (0.3, 0.35, 0.55) m, radius 0.08 m\n" in text
+    assert "wall: position (0.5, 0, 0.15) m, rotation (0, 0, 0.349066) rad, size (0.1, 0.5, 0.3) m\n" in text
+    assert "the hull of 6 corners" in text
+    assert "data:" not in text
 
 
 def test_the_objective_is_described():
