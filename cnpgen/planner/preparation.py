@@ -67,7 +67,7 @@ class Preparation:
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
 
     def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
-        """Heights of the obstacles' upper faces [m], shape (N, obstacles)."""
+        """Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers)."""
         return obstacle_tops(self.problem, start_xyz, goal_xyz)
 
 
