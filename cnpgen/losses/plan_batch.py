@@ -24,7 +24,7 @@ class PlanBatch:
     Attributes:
         path: Path control points [rad], shape (N, C, n).
         rate: Rate control points [1/s], shape (N, R).
-        tops: Heights of the obstacles [m], shape (N, obstacles).
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
         start_tip: Positions of the tip at the start [m], shape (N, 3), float64, or None.
         good: Whether a plan is one: finite, with positive rate control points; shape (N,).
     """
@@ -72,7 +72,7 @@ def check_batch(
     """Make a batch of what a caller gives.
 
     Raises:
-        UsageError: A shape is wrong, the heights of the obstacles are missing, or something is no real number.
+        UsageError: A shape is wrong, what says where the obstacles are is missing, or something is no real number.
     """
     given = {"path": (path, dtype), "rate": (rate, dtype), "tops": (tops, dtype), "start_tip": (start_tip, "float64")}
     found = {
@@ -96,7 +96,7 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
         shapes: Those of ``path``, ``rate`` and, where they are given, ``tops`` and ``start_tip``.
 
     Raises:
-        UsageError: A shape is wrong, or the heights of the obstacles are missing.
+        UsageError: A shape is wrong, or what says where the obstacles are is missing.
     """
     spec, numbers = problem.trajectory, count_numbers(problem.obstacle)
     if numbers and "tops" not in shapes:

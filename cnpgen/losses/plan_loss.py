@@ -126,7 +126,7 @@ class PlanLoss:
             rate: Rate control points [1/s], shape (N, R), positive.
             weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, where terms that are not
                 named keep the problem's, ``weights0``.
-            tops: Heights of the obstacles' upper faces [m], shape (N, obstacles); needed where the problem has any.
+            tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers); needed where there are any.
             start_tip: Positions of the tip at the start [m], shape (N, 3): motions that start off the table are then
                 given the way to it that ``Constraint.funnel`` says; by default they must be on it at once.
             shift: Of the quadrature nodes, see ``quadrature``.
@@ -192,7 +192,7 @@ class PlanLoss:
             shapes: Those of ``path``, ``rate``, ``weights`` and, where they are given, ``tops`` and ``start_tip``.
 
         Raises:
-            UsageError: A shape is wrong, or the heights of the obstacles are missing.
+            UsageError: A shape is wrong, or what says where the obstacles are is missing.
         """
         self._check_count(shapes.pop("weights"))
         check_shapes(self.problem, shapes)

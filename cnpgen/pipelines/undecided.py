@@ -35,7 +35,7 @@ def settle(context: Context, end: End, *, exact: bool = True) -> Settle | None:
         exact: Whether its state must be exact; else it may be as far outside as motions may.
 
     Returns:
-        A function of states ``(q, dq, ddq)``, shape (n, N) each, heights of obstacles, shape (obstacles, N), and which
+        A function of states ``(q, dq, ddq)``, shape (n, N) each, numbers of obstacles, shape (numbers, N), and which
         of the N are worth asking for; it says which constraints these break, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot

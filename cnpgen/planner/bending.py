@@ -36,7 +36,7 @@ def bend(
         robot: The robot.
         problem: The problem.
         control: All control points of the path, SX scalars [rad].
-        tops: Heights of the obstacles' upper faces [m].
+        tops: Where the obstacles are, as ``obstacle_tops`` says.
         steps: Number of Gauss-Newton steps.
         fixed_at_goal: Number of control points that the goal fixes.
     """
@@ -57,7 +57,7 @@ def _gauss_newton(equality: Any, q: list[Vec], tops: Vec, inner: Array, response
     Args:
         equality: Function of ``equality_residuals``.
         q: Positions at the K phases.
-        tops: Heights of the obstacles.
+        tops: Where the obstacles are, as ``obstacle_tops`` says.
         inner: Basis of the interior control points at the phases, shape (K, interior points).
         response: How control points follow a force at the phases, shape (interior points, K).
     """

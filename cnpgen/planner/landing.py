@@ -37,7 +37,7 @@ class Landing:
 
         Args:
             path: Path control points [rad], shape (N, C, n).
-            tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
+            tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
 
         Returns:
             New control points, of the same shape and type.
@@ -53,7 +53,7 @@ class Landing:
 
         Args:
             path: Control points before [rad], shape (N, C, n).
-            tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
+            tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
             gradient: Gradient with respect to what ``land`` gave, shape (N, C, n).
         """
         (back,) = self.adjoint(lanes(path), lanes(tops), lanes(gradient[:, self.interior]))

@@ -122,7 +122,7 @@ class Omega:
         return self._built[0](checked)
 
     def tops(self, tasks: Tasks) -> Array:
-        """Heights of the obstacles' upper faces [m], shape (N, obstacles): ``tops`` of the loss."""
+        """Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers): ``tops`` of the loss."""
         return obstacle_tops(self.problem, tasks.start_xyz, tasks.goal_xyz)
 
     @one_thread()

@@ -76,7 +76,7 @@ class Preparation:
         return reaching_time(boundary, self.velocity_limit, self.acceleration_limit)
 
     def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
-        """Heights of the obstacles' upper faces [m], shape (N, obstacles)."""
+        """Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers)."""
         return obstacle_tops(self.problem, start_xyz, goal_xyz)
 
 

@@ -59,7 +59,7 @@ class Slowing:
 
         Args:
             motion: N motions, with the problem's numbers of control points.
-            tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
+            tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
 
         Returns:
             Shape (N,).

@@ -50,7 +50,7 @@ class Task:
 
     Attributes:
         boundary: Boundary conditions of one motion, shape (1, n) each.
-        tops: Heights of its obstacles [m], shape (obstacles,).
+        tops: Where its obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         start_xyz: Position of the tip at the start [m], shape (3,).
         goal_xyz: Position of the tip at the goal [m], shape (3,).
         path: Path control points of the given plan [rad], shape (C, n), or None.

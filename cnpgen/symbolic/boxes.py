@@ -12,6 +12,7 @@ ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one 
 TOUCHING = 1e-30  # m^2: the square root of less has no gradient
 FLAT = 1e-12  # m: what a segment's extent along an axis is taken for where it has none, so that there is 1 / extent
 PARALLEL = 1e-16  # m^2: a segment that is no further along an edge's normals is parallel to the edge
+SINE = 1e-12  # square of the sine of an angle: edges that are closer to parallel have no common normal
 POINT = 1e-12  # m^2: keeps a signed distance of nothing differentiable
 
 
@@ -180,4 +181,26 @@ def upright_box_separation(centre: Vec, rotation: list[Vec], size: tuple[float, 
     best = gaps[0]
     for gap in gaps[1:]:
         best = ca.fmax(best, gap)
+    return best
+
+
+def cuboid_separation(place: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:
+    """Separation of two cuboids along the best of their 15 axes [m].
+
+    Args:
+        place: Centre of the first in the frame of the second [m].
+        axes: Its axes there.
+        half: Half its edge lengths [m].
+        other: Half the edge lengths of the second [m].
+    """
+    import casadi as ca
+
+    units = [[float(i == j) for j in range(3)] for i in range(3)]
+    best: Scalar = -ENDLESS
+    for normal in [*units, *axes, *(cross(unit, axis) for unit in units for axis in axes)]:
+        square = dot(normal, normal)
+        reach = sum(edge * ca.fabs(dot(normal, axis)) for edge, axis in zip(half, axes, strict=True))
+        reach = reach + sum(edge * ca.fabs(x) for edge, x in zip(other, normal, strict=True))
+        apart = (ca.fabs(dot(normal, place)) - reach) / ca.sqrt(ca.fmax(square, SINE))
+        best = ca.fmax(best, ca.if_else(square > SINE, apart, -ENDLESS))
     return best

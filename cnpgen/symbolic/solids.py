@@ -17,12 +17,13 @@ from cnpgen.robots.solid import number_slices
 from cnpgen.symbolic.boxes import (
     ENDLESS,
     Bounds,
+    cuboid_separation,
     segment_box_distance,
     segment_box_separation,
     signed_segment_box_distance,
     upright_box_separation,
 )
-from cnpgen.symbolic.linalg import Scalar, add, cross, dot, scale, subtract
+from cnpgen.symbolic.linalg import Scalar, add, dot, scale, subtract
 from cnpgen.symbolic.segments import POINT, segment_distance
 from cnpgen.symbolic.state import SymbolicState, Vec
 
@@ -33,7 +34,6 @@ Size = tuple[float, float, float]
 Hold = Callable[[Scalar], Scalar]
 
 HALVINGS = 6  # of a segment, after which its point nearest to a cylinder is known
-PARALLEL = 1e-12  # of the sine squared of an angle: edges that are closer to parallel have no common normal
 
 
 class SymbolicSolid(ABC):
@@ -137,7 +137,7 @@ class BoxForm(SymbolicSolid):
     def cuboid_separation(self, centre: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Try all 15 axes that can separate two cuboids."""
         place = subtract(self.within(centre), self.centre)
-        return _cuboids_apart(place, self.axes_within(rotation), [edge / 2 for edge in size], self.half)
+        return cuboid_separation(place, self.axes_within(rotation), [edge / 2 for edge in size], self.half)
 
 
 @dataclass(frozen=True)
@@ -323,28 +323,6 @@ def _upright(obstacle: "Obstacle", top: Scalar) -> UprightForm:
     height, spans = obstacle.height, [each for each in (obstacle.x, obstacle.y) if each is not None]
     sides: Bounds = [(span.low, span.high) for span in spans]
     return UprightForm([*sides, (None if height is None else top - height, top)])
-
-
-def _cuboids_apart(place: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:
-    """Separation of two cuboids along the best of their 15 axes [m].
-
-    Args:
-        place: Centre of the first in the frame of the second [m].
-        axes: Its axes there.
-        half: Half its edge lengths [m].
-        other: Half the edge lengths of the second [m].
-    """
-    import casadi as ca
-
-    units = [[float(i == j) for j in range(3)] for i in range(3)]
-    best: Scalar = -ENDLESS
-    for normal in [*units, *axes, *(cross(unit, axis) for unit in units for axis in axes)]:
-        square = dot(normal, normal)
-        reach = sum(edge * ca.fabs(dot(normal, axis)) for edge, axis in zip(half, axes, strict=True))
-        reach = reach + sum(edge * ca.fabs(x) for edge, x in zip(other, normal, strict=True))
-        apart = (ca.fabs(dot(normal, place)) - reach) / ca.sqrt(ca.fmax(square, PARALLEL))
-        best = ca.fmax(best, ca.if_else(square > PARALLEL, apart, -ENDLESS))
-    return best
 
 
 def _three_rows(numbers: Vec) -> list[Vec]:

@@ -25,7 +25,7 @@ class Rows:
     Attributes:
         tasks: The tasks.
         features: The network's inputs, shape (N, F).
-        tops: Heights of the obstacles' upper faces [m], shape (N, obstacles).
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
         shown: Control points of demonstrations; None where there are none.
     """
 

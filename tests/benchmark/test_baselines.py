@@ -11,6 +11,7 @@ from scipy.optimize import LinearConstraint, minimize
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
+from cnpgen.benchmark.planners.boxes import boxes_of
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.tip import Tip
@@ -20,6 +21,7 @@ from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem
+from cnpgen.robots.obstacle import Obstacle
 
 
 def one_of(suite: str, index: int = 0) -> Plans:
@@ -167,3 +169,10 @@ def test_planners_know_the_tip_if_a_joint_has_its_name() -> None:
     robot = open_problem(replace(task.problem, urdf=urdf))[1]
     tip = Tip(robot).at(task.boundary.start_q[0])[0]
     np.testing.assert_allclose(tip, task.problem.tip_positions(task.boundary.start_q)[0], atol=1e-12)
+
+
+def test_baselines_know_upright_boxes_only() -> None:
+    problem, _ = open_problem(one_of("heavy-100").problem)
+    ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
+    with pytest.raises(UsageError, match="it knows upright boxes only, and 'heavy-object' has ball"):
+        boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), np.zeros(3), np.zeros(3))

@@ -23,6 +23,7 @@ from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
 from tests.examples.example_robots import with_robots
 from tests.examples.jerky import jerky
+from tests.examples.shaped_robot import KINDS as EVERY_KIND
 from tests.examples.shaped_robot import write_problem
 
 
@@ -94,6 +95,14 @@ def test_an_object_and_obstacles_are_described():
     text = describe(load_problem("heavy-object"))
     assert "(0.2, 0.2, 0.3) m" in text
     assert "pedestal-2: x [0.2, 0.6] m" in text
+
+
+def test_obstacles_of_every_kind_are_described_by_what_is_theirs(tmp_path):
+    text = " ".join(describe(load_problem(write_problem(tmp_path, obstacles=EVERY_KIND))).split())
+    assert "ball: kind sphere, position (0.3, 0.35, 0.55) m, radius 0.08 m obstacle" in text
+    assert "wall: position (0.5, 0, 0.15) m, rotation (0, 0, 0.349066) rad, size (0.1, 0.5, 0.3) m obstacle" in text
+    assert "the hull of 6 corners" in text
+    assert "data:" not in text
 
 
 def test_the_objective_is_described():

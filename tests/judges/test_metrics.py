@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cnpgen.robots.obstacle import Obstacle
 from tests.examples.plans import course, load
 
 
@@ -98,3 +99,17 @@ def test_a_plan_that_does_not_end_at_the_goal_is_not_finished():
     assert not away.paper.valid
     assert away.valid  # its joints do what the boundary conditions ask for
     assert replace(plan, goal_xyz=plan.goal_xyz + np.array([0.005, 0, 0])).judged().paper.finished
+
+
+@pytest.mark.parametrize(("lower", "valid", "paper"), [(0.0, True, True), (-0.01, False, True), (-0.03, False, False)])
+def test_pedestals_of_another_kind_are_judged_likewise(lower, valid, paper):
+    plan = load("transport")
+    places = {"start": plan.start_xyz[0], "goal": plan.goal_xyz[0]}
+    stands = tuple(
+        Obstacle(name=end, kind="cylinder", radius=0.2, length=0.3, position=(x, y, -lower), below=end)
+        for end, (x, y, _) in places.items()
+    )
+    verdict = replace(plan, problem=replace(plan.problem, obstacle=stands)).judged()
+    assert verdict.paper.valid == paper
+    assert ("object in collision" in verdict.paper.broken) == (not paper)
+    assert valid or not verdict.valid

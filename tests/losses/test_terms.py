@@ -14,6 +14,8 @@ from cnpgen.kernels.tape import GridSpec, tape_from_function
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import constraint_term
 from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.symbolic.boxes import signed_segment_box_distance
 from cnpgen.symbolic.state import HeldState, SymbolicState, symbols
 from tests.examples.losses import huber
@@ -155,6 +157,20 @@ def poses(q: Array) -> tuple[list[Array], Array, Array]:
 def configurations() -> list[Array]:
     robot, random = ROBOTS["heavy-object"], np.random.default_rng(5)
     return list(random.uniform(robot.position_lower, robot.position_upper, (300, robot.n)))
+
+
+def test_of_obstacles_with_a_pose_the_paper_says_nothing() -> None:
+    problem, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
+    ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
+    (q_sx, q), zero = symbols("q", robot.n), [0.0] * robot.n
+    tops = place_obstacles([ball]).tolist()
+    state = SymbolicState(robot, q, zero, zero, tops, (ball,), problem.object_size)
+    for kind in ("RobotClearance", "ObjectContact"):
+        constraint = constraint_of(kind)
+        (one,), (other,) = published(constraint, state), constraint.penalised(state)
+        values = ca.Function("both", [q_sx], [ca.vertcat(*one.g), ca.vertcat(*other.g)])
+        for value, expected in (values(each) for each in configurations()[:5]):
+            np.testing.assert_array_equal(np.array(value), np.array(expected))
 
 
 TOPS = np.array([0.25, 0.6])

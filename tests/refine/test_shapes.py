@@ -25,10 +25,10 @@ def solved(where: Path, n: int) -> Plans:
     return load_plans(where / "plans.h5")
 
 
-def valid_states(plans: Plans) -> list[np.ndarray]:
-    """What valid plans do at 1 ms, plan by plan."""
+def valid_states(plans: Plans, step: float = 1e-3) -> list[np.ndarray]:
+    """What valid plans do every ``step`` [s], plan by plan."""
     verdicts = evaluate_plans(plans, workers=1).verdicts
-    return [states(plans, index) for index, verdict in enumerate(verdicts) if verdict.valid]
+    return [states(plans, index, step) for index, verdict in enumerate(verdicts) if verdict.valid]
 
 
 @pytest.mark.parametrize("obstacles", [OBSTACLES, KINDS], ids=["boxes", "kinds"])
@@ -36,8 +36,9 @@ def test_valid_plans_touch_nothing(tmp_path, obstacles):
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles))
     write_pipeline(tmp_path)
     meshes = Meshes(problem, load_robot(problem), tmp_path)
-    found = valid_states(solved(tmp_path, 12))
+    found = valid_states(solved(tmp_path, 12), step=2e-5)  # motions without limits take 10 ms
     assert len(found) >= 8
+    assert min(map(len, found)) > 100
     allowed = 1e-4  # m: the tolerance of the problem
     for path in found:
         assert min(min(meshes.distances(q)) for q in path[:: max(len(path) // 100, 1)]) > -allowed - 1e-6

@@ -69,7 +69,7 @@ def plan_loss(
         path: Path control points [rad], shape (N, C, n), of any type.
         rate: Rate control points [1/s], shape (N, R), positive.
         weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, as ``PlanLoss`` takes them.
-        tops: Heights of the obstacles' upper faces [m], shape (N, obstacles). Like those that follow, a constant, but
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers). A constant like what follows, but
             under ``jit`` it may be an argument.
         start_tip: Positions of the tip at the start [m], shape (N, 3).
         shift: Of the quadrature nodes, in [0, 1); where its value is not known yet, whole numbers in it do not count.

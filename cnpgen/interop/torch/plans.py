@@ -73,7 +73,7 @@ def plan_loss(
         path: Path control points [rad], shape (N, C, n), on any device, of any type.
         rate: Rate control points [1/s], shape (N, R), positive.
         weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, as ``PlanLoss`` takes them.
-        tops: Heights of the obstacles' upper faces [m], shape (N, obstacles); a constant.
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers); a constant.
         start_tip: Positions of the tip at the start [m], shape (N, 3); a constant.
         shift: Of the quadrature nodes, in [0, 1).
 

@@ -133,7 +133,7 @@ class _Plan:
         problem: The problem.
         motion: One motion.
         boundary: Its boundary conditions.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         goal_xyz: Where the tip must end [m], shape (3,).
     """
 

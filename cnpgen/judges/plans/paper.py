@@ -44,7 +44,7 @@ def paper_rule(problem: "Problem", world: "PathWorld", tops: Array, goal_xyz: Ar
     Args:
         problem: The problem.
         world: Its robot at the samples of the motion.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         goal_xyz: Where the tip must end [m], shape (3,).
     """
     finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < GOAL)

@@ -50,7 +50,7 @@ def plot_plan(
         motion: N motions.
         index: Which of them.
         path: Picture file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,); by default as the motion's ends have them.
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,); by default by the motion's ends.
         note: What the title says besides.
 
     Raises:

@@ -26,7 +26,7 @@ class Survey:
     Attributes:
         problem: The problem.
         motion: One motion.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         samples: When and at which phases it was looked at first.
         table: Its times at ``table_phases()`` [s].
         start_tip: Where the tip is at the start [m], shape (3,).
@@ -65,7 +65,7 @@ def survey(  # noqa: PLR0917 - each of them is half of what is surveyed
     Args:
         problem: The problem.
         motion: One motion.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         world: The robot at the samples.
         samples: When and at which phases that is.
         table: Times of the motion at ``table_phases()`` [s].

@@ -117,7 +117,7 @@ class Collision(Stage):
 
 
 def sample_tops(problem: Problem, draws: Round) -> Array:
-    """Heights of the obstacles' upper faces for every draw [m], shape (obstacles, n)."""
+    """Where the obstacles are for every draw, as ``obstacle_tops`` says, shape (numbers, n)."""
     return np.ascontiguousarray(obstacle_tops(problem, draws["start_xyz"].T, draws["goal_xyz"].T).T)
 
 

@@ -76,7 +76,7 @@ class Transcription:
         stage: The kernels.
         grid: The grid.
         boundary: Boundary conditions of one motion.
-        tops: Heights of its obstacles [m], shape (obstacles,).
+        tops: Where its obstacles are, as ``obstacle_tops`` says, shape (numbers,).
     """
 
     def __init__(self, stage: ResidualKernels, grid: Grid, *, boundary: Boundary, tops: Array) -> None:
