@@ -4,6 +4,10 @@ from cnpgen.benchmark.pucks import Pucks as Pucks
 from cnpgen.benchmark.report import save_benchmark_report as save_benchmark_report
 from cnpgen.benchmark.run import Benchmark as Benchmark
 from cnpgen.benchmark.run import run_benchmark as run_benchmark
+from cnpgen.benchmark.simulator.executed import Executed as Executed
+from cnpgen.benchmark.simulator.plant import Plant as Plant
+from cnpgen.benchmark.simulator.simulate import Simulation as Simulation
+from cnpgen.benchmark.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.benchmark.suite import Draws as Draws
 from cnpgen.benchmark.suite import Suite as Suite
 from cnpgen.benchmark.suite import load_suite as load_suite
@@ -97,10 +101,6 @@ from cnpgen.robots.spec import LimitSpec as LimitSpec
 from cnpgen.robots.spec import Payload as Payload
 from cnpgen.robots.spec import RobotSpec as RobotSpec
 from cnpgen.schema.catalogue import list_recipes as list_recipes
-from cnpgen.simulator.executed import Executed as Executed
-from cnpgen.simulator.plant import Plant as Plant
-from cnpgen.simulator.simulate import Simulation as Simulation
-from cnpgen.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.store.blueprint import Blueprint as Blueprint
 from cnpgen.store.blueprint import ShardTask as ShardTask
 from cnpgen.store.blueprint import StoredProblem as StoredProblem

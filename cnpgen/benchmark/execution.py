@@ -3,16 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator.execute import Execution
+from cnpgen.benchmark.simulator.executed import Executed
+from cnpgen.benchmark.simulator.plant import Plant
+from cnpgen.benchmark.simulator.reference import Reference, StatesAt, states_of
+from cnpgen.benchmark.simulator.scene import Scene
+from cnpgen.benchmark.simulator.simulate import execute_states
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.benchmark.turns import Lead
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
-from cnpgen.simulator.execute import Execution
-from cnpgen.simulator.executed import Executed
-from cnpgen.simulator.plant import Plant
-from cnpgen.simulator.reference import Reference, StatesAt, states_of
-from cnpgen.simulator.scene import Scene
-from cnpgen.simulator.simulate import execute_states
 
 Array = NDArray[np.float64]
 Task = tuple[Plans, Plans | Trajectory, Lead | None]

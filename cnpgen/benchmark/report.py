@@ -9,10 +9,10 @@ from typing import Any
 from cnpgen.benchmark.execution import execution_of
 from cnpgen.benchmark.results import answer_from_dict
 from cnpgen.benchmark.run import Benchmark
+from cnpgen.benchmark.simulator.picture import save_picture
+from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.statistics import FIGURES, FLAGS, values_of
 from cnpgen.errors import MachineError
-from cnpgen.simulator.picture import save_picture
-from cnpgen.simulator.plant import Plant
 from cnpgen.store.files.atomic import write_file
 
 PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> what the paper's text says of it

@@ -14,6 +14,9 @@ from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.process import Attempt, PlannerProcess
 from cnpgen.benchmark.results import Results, answer_from_dict, answer_to_dict, open_results
+from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
+from cnpgen.benchmark.simulator.execute import load_mujoco
+from cnpgen.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.benchmark.statistics import summarise_results
 from cnpgen.benchmark.suite import Suite, load_suite
 from cnpgen.benchmark.turns import Lead
@@ -26,9 +29,6 @@ from cnpgen.problems.problem import resolved
 from cnpgen.problems.record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.arguments import integer, number
-from cnpgen.simulator.challenge import challenge_plant, check_challenge
-from cnpgen.simulator.execute import load_mujoco
-from cnpgen.simulator.plant import Plant, as_plant
 from cnpgen.store.files.documents import canonical_sha256, plain
 
 PART = 4  # problems that one of several planners of a kind plans for: its start takes some seconds

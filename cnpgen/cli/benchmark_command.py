@@ -129,11 +129,11 @@ def _text(found: "Benchmark") -> str:
 
 def _listing(*, as_json: bool) -> str:
     """List what there is to compare, and on what."""
+    from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
     from cnpgen.cli.describe import table
     from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.schema import registry
-    from cnpgen.simulator.plant import PLANTS
 
     planners = {
         name: kind_summary(registry.load(registry.PLANNERS, name)) for name in registry.names(registry.PLANNERS)

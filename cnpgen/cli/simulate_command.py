@@ -12,9 +12,9 @@ from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
+    from cnpgen.benchmark.simulator.plant import Plant
+    from cnpgen.benchmark.simulator.simulate import Simulation
     from cnpgen.plans import Plans
-    from cnpgen.simulator.plant import Plant
-    from cnpgen.simulator.simulate import Simulation
 
 PLANTS = ("nominal", "heavier", "delayed")
 
@@ -61,8 +61,8 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from cnpgen.benchmark.simulator.simulate import simulate_plans
     from cnpgen.errors import UsageError
-    from cnpgen.simulator.simulate import simulate_plans
 
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
@@ -120,8 +120,8 @@ def _lines(found: "Simulation") -> list[str]:
 
 
 def _draw(arguments: argparse.Namespace, plan: "Plans", plant: "Plant") -> None:
-    from cnpgen.simulator.picture import save_film, save_picture
-    from cnpgen.simulator.simulate import execute_plan
+    from cnpgen.benchmark.simulator.picture import save_film, save_picture
+    from cnpgen.benchmark.simulator.simulate import execute_plan
 
     if not (arguments.image or arguments.video):
         return

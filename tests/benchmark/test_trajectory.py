@@ -5,10 +5,10 @@ import pytest
 
 from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.judging import judge_answer
+from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, make_plans
-from cnpgen.simulator.plant import PLANTS
 from tests.examples.plans import load
 
 T = np.linspace(0, 1, 5)

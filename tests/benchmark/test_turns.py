@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from cnpgen.benchmark.execution import execution_of, joined
+from cnpgen.benchmark.simulator.plant import PLANTS
+from cnpgen.benchmark.simulator.reference import states_of
 from cnpgen.benchmark.suite import list_suites, load_suite
 from cnpgen.errors import RecipeError
 from cnpgen.planner.planner import Planner
 from cnpgen.refine.plans import refine_plans
-from cnpgen.simulator.plant import PLANTS
-from cnpgen.simulator.reference import states_of
 
 
 @pytest.mark.parametrize("name", ["replan", "feint"])

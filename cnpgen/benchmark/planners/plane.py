@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.simulator.hockey import HOME, LENGTH, MALLET_RADIUS, WIDTH
+from cnpgen.benchmark.simulator.hockey import HOME, LENGTH, MALLET_RADIUS, WIDTH
 
 Array = NDArray[np.float64]
 

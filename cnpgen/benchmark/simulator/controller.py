@@ -5,9 +5,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.simulator.plant import Plant, rated_torque
 
 Array = NDArray[np.float64]
 

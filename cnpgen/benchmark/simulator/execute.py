@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator.challenge import execute_in_challenge
+from cnpgen.benchmark.simulator.controller import Controller
+from cnpgen.benchmark.simulator.executed import Executed
+from cnpgen.benchmark.simulator.outcome import Seen, outcome_of, puck_is_done
+from cnpgen.benchmark.simulator.reference import TICK, Reference
+from cnpgen.benchmark.simulator.scene import STEP, Scene, scene_xml
 from cnpgen.errors import MachineError, RecipeError
-from cnpgen.simulator.challenge import execute_in_challenge
-from cnpgen.simulator.controller import Controller
-from cnpgen.simulator.executed import Executed
-from cnpgen.simulator.outcome import Seen, outcome_of, puck_is_done
-from cnpgen.simulator.reference import TICK, Reference
-from cnpgen.simulator.scene import STEP, Scene, scene_xml
 
 Array = NDArray[np.float64]
 

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.benchmark.simulator.execute import execute
+from cnpgen.benchmark.simulator.plant import PLANTS, as_plant
+from cnpgen.benchmark.simulator.reference import TICK, Reference
+from cnpgen.benchmark.simulator.simulate import execute_plan, scene_of, simulate_plans
 from cnpgen.errors import UsageError
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, make_plans
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.refine.plans import solve_plans
 from cnpgen.schema.catalogue import list_recipes
-from cnpgen.simulator.execute import execute
-from cnpgen.simulator.plant import PLANTS, as_plant
-from cnpgen.simulator.reference import TICK, Reference
-from cnpgen.simulator.simulate import execute_plan, scene_of, simulate_plans
 from tests.examples.plans import ROBOTS, load
 
 pytest.importorskip("mujoco")

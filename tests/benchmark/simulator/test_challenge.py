@@ -10,15 +10,15 @@ import pytest
 
 from cnpgen.benchmark.report import save_benchmark_report
 from cnpgen.benchmark.run import run_benchmark
+from cnpgen.benchmark.simulator.challenge import challenge_plant
+from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, save_plans
 from cnpgen.refine.plans import solve_plans
-from cnpgen.simulator.challenge import challenge_plant
-from cnpgen.simulator.simulate import execute_plan, simulate_plans
 
 pytest.importorskip("mujoco")
-CLONE = Path(__file__).parents[1] / "examples" / "challenge"
+CLONE = Path(__file__).parents[2] / "examples" / "challenge"
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_a_clone_that_cannot_be_used_is_told_of(files: dict[str, str], said: str
     folder = clone(tmp_path / "clone", **files)
     code = f"""
 from cnpgen.errors import MachineError
-from cnpgen.simulator.challenge import challenge_plant
+from cnpgen.benchmark.simulator.challenge import challenge_plant
 try:
     challenge_plant({str(folder)!r})
 except MachineError as error:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator import hockey
+from cnpgen.benchmark.simulator.plant import Plant, joint_friction
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -18,8 +20,6 @@ from cnpgen.robots.chain import Joint
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Box, Solid, solids_of
-from cnpgen.simulator import hockey
-from cnpgen.simulator.plant import Plant, joint_friction
 
 Array = NDArray[np.float64]
 

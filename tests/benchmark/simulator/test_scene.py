@@ -6,14 +6,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.benchmark.simulator import hockey
+from cnpgen.benchmark.simulator.controller import Controller
+from cnpgen.benchmark.simulator.plant import PLANTS, Plant
+from cnpgen.benchmark.simulator.scene import Scene, scene_xml
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.spec import Payload
 from cnpgen.schema.keys import PerJoint
-from cnpgen.simulator import hockey
-from cnpgen.simulator.controller import Controller
-from cnpgen.simulator.plant import PLANTS, Plant
-from cnpgen.simulator.scene import Scene, scene_xml
 from cnpgen.world.state import World
 from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import PROBLEMS, ROBOTS

@@ -10,6 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
+from cnpgen.benchmark.simulator.execute import Execution, execute, load_mujoco
+from cnpgen.benchmark.simulator.executed import Executed
+from cnpgen.benchmark.simulator.hockey import puck_of
+from cnpgen.benchmark.simulator.plant import Plant, as_plant
+from cnpgen.benchmark.simulator.reference import Reference, StatesAt, make_reference, states_of
+from cnpgen.benchmark.simulator.scene import Scene
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import share_out, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
@@ -17,13 +24,6 @@ from cnpgen.plans.tips import settle_tips
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.record import open_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.simulator.challenge import challenge_plant, check_challenge
-from cnpgen.simulator.execute import Execution, execute, load_mujoco
-from cnpgen.simulator.executed import Executed
-from cnpgen.simulator.hockey import puck_of
-from cnpgen.simulator.plant import Plant, as_plant
-from cnpgen.simulator.reference import Reference, StatesAt, make_reference, states_of
-from cnpgen.simulator.scene import Scene
 
 Array = NDArray[np.float64]
 

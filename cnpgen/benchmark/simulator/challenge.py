@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator.outcome import Seen, puck_is_done
+from cnpgen.benchmark.simulator.plant import Plant, rated_torque
+from cnpgen.benchmark.simulator.reference import Reference
+from cnpgen.benchmark.simulator.scene import Scene
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.simulator.outcome import Seen, puck_is_done
-from cnpgen.simulator.plant import Plant, rated_torque
-from cnpgen.simulator.reference import Reference
-from cnpgen.simulator.scene import Scene
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator import hockey
+from cnpgen.benchmark.simulator.execute import Execution, compile_scene, load_mujoco
+from cnpgen.benchmark.simulator.reference import TICK
+from cnpgen.benchmark.simulator.scene import Scene
 from cnpgen.errors import MachineError
-from cnpgen.simulator import hockey
-from cnpgen.simulator.execute import Execution, compile_scene, load_mujoco
-from cnpgen.simulator.reference import TICK
-from cnpgen.simulator.scene import Scene
 from cnpgen.store.files.atomic import machine_error
 
 WIDTH, HEIGHT = 640, 480

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.simulator import hockey
+from cnpgen.benchmark.simulator.executed import Executed
+from cnpgen.benchmark.simulator.reference import TICK, Reference
+from cnpgen.benchmark.simulator.scene import Scene
 from cnpgen.judges.plans.metrics import tilt
-from cnpgen.simulator import hockey
-from cnpgen.simulator.executed import Executed
-from cnpgen.simulator.reference import TICK, Reference
-from cnpgen.simulator.scene import Scene
 
 Array = NDArray[np.float64]
 
