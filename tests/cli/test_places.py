@@ -148,7 +148,7 @@ def test_a_model_is_not_a_file_of_plans(said: Said, tmp_path: Path) -> None:
 def test_force_does_not_replace_a_model_by_plans(said: Said, tmp_path: Path, hit: Path) -> None:
     model = shipped_models()["airhockey-hit"]
     shutil.copy(model, tmp_path / "mine.h5")
-    code, line = said(("refine", "{}", "-o", "mine.h5", "--force"), str(hit))
+    code, line = said(("refine", "{}", "-o", "mine.h5", "--force", "--quiet"), str(hit))
     assert (code, line.partition(":")[0]) == (2, "mine.h5 is a model of cnpgen, not one of plans")
     assert (tmp_path / "mine.h5").read_bytes() == model.read_bytes()
 

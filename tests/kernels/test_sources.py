@@ -66,7 +66,9 @@ BUILDERS = sorted(filter(makes_functions, MODULES))
 
 
 def test_the_builders_of_every_room_are_found() -> None:
-    assert {name.split(".")[1] for name in BUILDERS} == {"losses", "pipelines", "planner", "refine", "symbolic"}
+    assert {name.split(".")[1] for name in BUILDERS} == {
+        *("benchmark", "losses", "pipelines", "planner", "refine", "symbolic"),
+    }
 
 
 @pytest.mark.parametrize("module", BUILDERS)

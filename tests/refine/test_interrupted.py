@@ -98,7 +98,8 @@ def test_a_file_that_cannot_grow_is_one_line_and_the_same_command_goes_on(
     command = [sys.executable, "-c", LIMITED, str(limit), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (3, "")
-    begun, error = done.stderr.splitlines()
+    checked, begun, error = done.stderr.splitlines()
+    assert checked == f"{given}: the file's checksum is right"
     assert begun == f"refining {given}: {N} plans"
     file = "out.h5.part" if limit < 20_000 else "out.h5"
     assert error.startswith(f"cnpgen: error: cannot write {tmp_path / file}: File too large; ")

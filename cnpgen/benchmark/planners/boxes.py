@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Box = tuple[Array, Array]
 """Lower and upper corner [m], shape (3,) each; an obstacle reaches down without end."""
 
+APART, DEEP = 0.14, 0.01  # m: of the object's centre from pedestals, and of a corner in one: what samplers keep
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 

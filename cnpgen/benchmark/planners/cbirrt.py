@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.boxes import CORNERS, boxes_of, depth, distance
+from cnpgen.benchmark.planners.boxes import APART, CORNERS, DEEP, boxes_of, depth, distance
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import MachineError
@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 TOLERANCE, PROJECTIONS, DELTA, LAMBDA = 0.01, 50, 0.05, 2.0  # of the manifold; the last three are OMPL's own
 GOAL = 0.01  # rad: how far from the goal a path may end
-APART, DEEP = 0.14, 0.01  # m: of the object's centre from pedestals, and of a corner in one
 PAUSE = 1e-4  # s: added to the time of every step
 
 

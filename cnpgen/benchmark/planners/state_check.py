@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.boxes import CORNERS, require_transport
-from cnpgen.benchmark.planners.cbirrt import APART, DEEP
+from cnpgen.benchmark.planners.boxes import APART, CORNERS, DEEP, require_transport
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
