@@ -30,7 +30,9 @@ def weighted(learner: Learner, parameters: np.ndarray, rows: Rows, weights: np.n
     return float(np.mean(terms[:, 0] + terms[:, 1:] @ weights))
 
 
-@pytest.mark.parametrize(("dataset", "directions"), [("airhockey-replan", 3), ("heavy-object", 1)])
+@pytest.mark.parametrize(
+    ("dataset", "directions"), [("airhockey-replan", 3), pytest.param("heavy-object", 1, marks=pytest.mark.extended)]
+)
 def test_the_gradient_of_network_boundary_and_loss_together_is_that_of_finite_differences(tiny, dataset, directions):
     learner, rows, parameters = prepared(tiny, dataset)
     names = learner.loss.terms[1:]
