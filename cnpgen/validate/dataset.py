@@ -83,7 +83,7 @@ class ValidationReport:
                 for check in self.deep.checks
             ]
         if self.plans:
-            lines.append(f"  judged on a time grid of 1 ms: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
+            lines.append(f"  judged at every moment: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
         if self.wanted:
             lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
         advice = dict.fromkeys(finding.advice for finding in self.findings if finding.advice and not finding.note)
