@@ -77,7 +77,7 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
         RecipeError: The problem has no table, or a puck cannot be hit.
     """
     problem = pucks.problem
-    table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+    table = problem.first(Table)
     if table is None:
         raise RecipeError([f"pucks.problem: {problem.name} has no table to put pucks on"])
     way = np.array(pucks.goal)[:, None] - puck

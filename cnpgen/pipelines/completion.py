@@ -102,7 +102,8 @@ class Completion:
 
 def _table_height(context: Context) -> float | None:
     """Return the height of the tip that positions on the problem's table have [m]; None where there is no table."""
-    return next((each.z for each in context.problem.constraint if isinstance(each, Table)), None)
+    table = context.problem.first(Table)
+    return None if table is None else table.z
 
 
 def given_fields(steps: Iterable[Step], context: Context) -> dict[str, Field]:

@@ -38,9 +38,8 @@ class Context:
         Raises:
             RecipeError: The problem has none, so that a stage that asks for it has no meaning there.
         """
-        for constraint in self.problem.constraint:
-            if isinstance(constraint, kind):
-                return constraint
+        if (constraint := self.problem.first(kind)) is not None:
+            return constraint
         name = registry.name_of(registry.CONSTRAINTS, kind)
         raise RecipeError([f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"])
 

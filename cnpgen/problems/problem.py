@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.files import find_urdf
@@ -20,6 +20,8 @@ from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.keys import NAME, field, to_dict
 from cnpgen.trajectory.spec import TrajectorySpec
+
+Kind = TypeVar("Kind", bound=Constraint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +57,16 @@ class Problem:
     trajectory: TrajectorySpec = field("how motions are parameterised", default=TrajectorySpec())
     objective: Objective = field("what is minimised", default=Objective())
     path: Path = Path()
+
+    def first(self, kind: type[Kind]) -> Kind | None:
+        """Return the first constraint of a kind; None if there is none."""
+        return next((each for each in self.constraint if isinstance(each, kind)), None)
+
+    @property
+    def arm_radius(self) -> float | None:
+        """How thick an arm that is a line is, as the first constraint of its clearance says [m]; None if none does."""
+        clearance = self.first(RobotClearance)
+        return None if clearance is None else clearance.radius
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""

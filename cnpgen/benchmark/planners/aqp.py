@@ -36,7 +36,7 @@ class AQP(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Check that there is a table to plan on."""
         problem, robot = open_problem(setting.problem)
-        table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+        table = problem.first(Table)
         if table is None or robot.n > len(WEIGHTS):
             raise UsageError(f"it plans hits on a table with up to 7 joints, {problem.name!r} is none")
 

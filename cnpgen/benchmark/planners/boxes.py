@@ -1,7 +1,5 @@
 """Points and boxes: how near, how deep, and in which direction out; the corners of the held object."""
 
-from itertools import product
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +13,6 @@ Box = tuple[Array, Array]
 """Lower and upper corner [m], shape (3,) each; an obstacle reaches down without end."""
 
 APART, DEEP = 0.14, 0.01  # m: of the object's centre from pedestals, and of a corner in one: what samplers keep
-CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 def boxes_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> tuple[Array, list[Box]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.boxes import APART, CORNERS, DEEP, boxes_of, depth, distance
+from cnpgen.benchmark.planners.boxes import APART, DEEP, boxes_of, depth, distance
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import MachineError
@@ -22,6 +22,7 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.hull import CUBE
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ class Search:
     def __init__(self, problem: Problem, robot: Robot, task: Plans) -> None:
         self._robot, self._tip = robot, Tip(robot)
         self._ends = task.boundary.start_q[0], task.boundary.goal_q[0]
-        self._table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+        self._table = problem.first(Table)
         self._data = robot.model.createData()
         if self._table is None:
             ends = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
@@ -106,7 +107,7 @@ class Search:
         holding = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
         if np.any(np.abs(holding) > self._robot.torque_limit):
             return False
-        corners = position + (CORNERS * self._size) @ rotation.T
+        corners = position + (CUBE * self._size) @ rotation.T
         return all(
             distance(position, box)[0] > APART and all(depth(corner, box)[0] < DEEP for corner in corners)
             for box in self._boxes

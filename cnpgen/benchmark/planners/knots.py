@@ -5,11 +5,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.boxes import CORNERS, Box, boxes_of, depth, distance
+from cnpgen.benchmark.planners.boxes import Box, boxes_of, depth, distance
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.hull import CUBE
 
 Array = NDArray[np.float64]
 KnotConstraints = Callable[[Array, Array, Array], tuple[Array, tuple[Array, Array, Array]]]
@@ -32,7 +33,7 @@ def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz:
     Raises:
         UsageError: The problem has neither a table nor a held object.
     """
-    table = next((each for each in problem.constraint if isinstance(each, Table)), None)
+    table = problem.first(Table)
     if table is not None:
         return _on_table(table, robot)
     return _carrying(robot, *boxes_of(problem, start_xyz, goal_xyz))
@@ -67,7 +68,7 @@ def _carrying(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
             apart, out = distance(position, box)
             values.append(min(apart - APART, 0.0))
             slopes.append(out @ J[:3] * (apart < APART))
-            for corner in (CORNERS * size) @ rotation.T:
+            for corner in (CUBE * size) @ rotation.T:
                 deep, out = depth(position + corner, box)
                 values.append(-deep)
                 slopes.append(-out @ (J[:3] + np.cross(turning.T, corner).T))

@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.boxes import APART, CORNERS, DEEP, require_transport
+from cnpgen.benchmark.planners.boxes import APART, DEEP, require_transport
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import count_numbers
 from cnpgen.symbolic.linalg import Scalar, dot
 from cnpgen.symbolic.state import SymbolicState, Vec, symbols
@@ -35,7 +36,7 @@ class StateCheck:
     """
 
     def __init__(self, problem: Problem, robot: "Robot") -> None:
-        if table_of(problem) is None:
+        if problem.first(Table) is None:
             require_transport(problem)
         self._problem, self._robot = problem, robot
         self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_excess)
@@ -67,11 +68,6 @@ class StateCheck:
         return np.asarray(self(q, still, still, tops)[0][0])
 
 
-def table_of(problem: Problem) -> Table | None:
-    """Return the table of a problem; None if it has none."""
-    return next((each for each in problem.constraint if isinstance(each, Table)), None)
-
-
 def tip_and_excess(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, dq, ddq, tops) -> (tip, excess)``: by how much the worst bound is exceeded, in its own unit."""
     import casadi as ca
@@ -79,7 +75,7 @@ def tip_and_excess(robot: "Robot", problem: Problem) -> Any:
     names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", count_numbers(problem.obstacle)))
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops) = (symbols(name, width) for name, width in names)
     state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, problem.object_size)
-    tip, table = state.kinematics.tip, table_of(problem)
+    tip, table = state.kinematics.tip, problem.first(Table)
     excess = [ca.fabs(value) - limit for value, limit in zip(dq, robot.velocity_limit.tolist(), strict=True)]
     excess += [ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)]
     excess += [low - value for value, low in zip(q, robot.position_lower.tolist(), strict=True)]
@@ -109,7 +105,7 @@ def _off_the_way(state: SymbolicState, tops: Vec) -> list[Scalar]:
     rotation, tip = state.kinematics.rotation, state.kinematics.tip
     corners = [
         [place + dot(row, corner) for place, row in zip(tip, rotation, strict=True)]
-        for corner in (CORNERS * np.array(state.object_size)).tolist()
+        for corner in (CUBE * np.array(state.object_size)).tolist()
     ]
     excess: list[Scalar] = [1.0 - rotation[2][2] - UPRIGHT]
     for box, top in zip(state.obstacles, tops, strict=True):

@@ -64,7 +64,8 @@ class Scene:
     @property
     def height(self) -> float | None:
         """Height of the tip over the table [m]; None without a table."""
-        return next((each.z for each in self.problem.constraint if isinstance(each, Table)), None)
+        table = self.problem.first(Table)
+        return None if table is None else table.z
 
 
 def scene_xml(scene: Scene) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
@@ -67,8 +66,7 @@ def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) ->
         return [
             wrapped(each.link, robot.shape.joints[each.link], each.vertices, each.radius) for each in pieces
         ], "pieces"
-    radius = next((each.radius for each in problem.constraint if isinstance(each, RobotClearance)), None)
-    return list(_line(robot, radius or THIN)), "line"
+    return list(_line(robot, problem.arm_radius or THIN)), "line"
 
 
 def capsule_bodies(robot: Robot) -> list[Body]:

@@ -24,7 +24,7 @@ def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array
     """
     robot = world.robot
     share = world.torque / robot.torque_limit[:, None]
-    table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
+    table = problem.first(Table)
     upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
     return Metrics(
         duration=float(samples.t[-1]),

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
@@ -72,7 +71,7 @@ def plot_plan(
     figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
     joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]
     _draw_joints(joints, world, t)
-    table = next((constraint for constraint in problem.constraint if isinstance(constraint, Table)), None)
+    table = problem.first(Table)
     if table is None:
         _draw_views(tip, problem, world, tops)
     else:
@@ -202,8 +201,7 @@ def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, floa
     """
     robot = world.robot
     if robot.shape is None:
-        radius = next((each.radius for each in problem.constraint if isinstance(each, RobotClearance)), None)
-        return [(segment, radius or 0.0) for segment in world.segments()[..., k]]
+        return [(segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]]
     joints = list(range(robot.n + 1))
     rotations, positions = trace(
         robot.model, robot.model.createData(), world.q[:, k : k + 1], joints, n_turned=robot.n + 1

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cnpgen.judges.rows.report import ENDS, Array, Check, Index, compare
-from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.world.state import World
 
 if TYPE_CHECKING:
@@ -78,6 +77,6 @@ def _torque_ratio(world: World) -> float:
 
 def _clearance(problem: "Problem") -> Iterator[tuple[str, str, str, Callable[[World], float]]]:
     """The distance from the nearest obstacle, less the radius that the problem gives the arm."""
-    radius = next((each.radius for each in problem.constraint if isinstance(each, RobotClearance)), None)
+    radius = problem.arm_radius
     if radius is not None and problem.obstacle:
         yield "clearance", "clearance", "m", lambda world: min(world.segment_distances()) - radius
