@@ -77,7 +77,16 @@ y = "[-0.05, 0.05] m"
 top = "0.4 m"
 height = "0.3 m"
 """
-CLUTTER = """
+CAGE = """
+[[obstacle]]
+name = "cage-{number}"
+kind = "cylinder"
+position = [{x}, {y}, 0.6]
+radius = "2 cm"
+length = 1.2
+"""
+BARS = ((0.3, 0.6), (0.3, -0.6), (-0.35, 0.35), (-0.35, -0.35))
+FURNITURE = """
 [[obstacle]]
 name = "table"
 position = [0.6, 0.0, 0.05]
@@ -91,30 +100,8 @@ name = "shelf-side"
 position = [0.6, 0.12, 0.3]
 size = [0.3, 0.02, 0.4]
 rotation = "[0, 0, 10] deg"
-[[obstacle]]
-name = "cage-1"
-kind = "cylinder"
-position = [0.3, 0.6, 0.6]
-radius = "2 cm"
-length = 1.2
-[[obstacle]]
-name = "cage-2"
-kind = "cylinder"
-position = [0.3, -0.6, 0.6]
-radius = "2 cm"
-length = 1.2
-[[obstacle]]
-name = "cage-3"
-kind = "cylinder"
-position = [-0.35, 0.35, 0.6]
-radius = "2 cm"
-length = 1.2
-[[obstacle]]
-name = "cage-4"
-kind = "cylinder"
-position = [-0.35, -0.35, 0.6]
-radius = "2 cm"
-length = 1.2
+"""
+PIPES = """
 [[obstacle]]
 name = "pipe-across"
 kind = "capsule"
@@ -135,6 +122,7 @@ kind = "sphere"
 position = [0.5, -0.1, 0.65]
 radius = "8 cm"
 """
+CLUTTER = FURNITURE + "".join(CAGE.format(number=i, x=x, y=y) for i, (x, y) in enumerate(BARS, 1)) + PIPES
 START = '["[0.4, 0.7] m", "[-0.4, -0.1] m", "[0.2, 0.6] m"]'
 GOAL = '["[0.4, 0.7] m", "[0.1, 0.4] m", "[0.2, 0.6] m"]'
 GUESS = """[

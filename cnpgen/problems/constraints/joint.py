@@ -84,7 +84,7 @@ class JointAcceleration(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointJerk(_RelativeLimit):
-    """``|jerk| <= jerk limit``: bounded, not continuous.
+    """No joint has more jerk than its limit: ``|jerk| <= limit``; it is bounded, not continuous.
 
     It is about motions: a boundary state has no jerk, and meets it.
     """
