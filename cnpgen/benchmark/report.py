@@ -14,6 +14,7 @@ from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.statistics import FIGURES, FLAGS, values_of
 from cnpgen.errors import MachineError
 from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.picture import new_figure
 
 PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> what the paper's text says of it
     "hits-81": {
@@ -95,13 +96,9 @@ def cell_text(found: dict[str, Any] | None, printed: str | None = None) -> str:
 
 def _boxes(benchmark: Benchmark, plant: str) -> str:
     """Draw box plots of all figures."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
     values = {name: [values_of(row, plant) for row in rows] for name, rows in benchmark.results.items()}
     shown = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
-    figure = Figure(figsize=(4 * min(len(shown), 4), 3 * -(-len(shown) // 4)), layout="constrained")
+    figure = new_figure(4 * min(len(shown), 4), 3 * -(-len(shown) // 4), dpi=100)
     for place, key in enumerate(shown, start=1):
         axes = figure.add_subplot(-(-len(shown) // 4), min(len(shown), 4), place)
         axes.boxplot([[row[key] for row in rows if key in row] for rows in values.values()])

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.symbolic.dynamics import body_motions, carried
 from cnpgen.symbolic.linalg import cross, dot
-from cnpgen.symbolic.state import SymbolicState, body_motions, carried
+from cnpgen.symbolic.state import SymbolicState
 
 ROUNDED = 0.05  # m/s^2: below, the centrifugal acceleration counts quadratically, so that its gradient is continuous
 SLOW = 1e-4  # m^2/s^2: keeps the direction of a tip at rest defined

@@ -16,7 +16,7 @@ from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.state import tip_position
+from cnpgen.symbolic.kinematics import tip_position
 from cnpgen.trajectory.moment import states_at_times
 from cnpgen.trajectory.motion import Motion
 

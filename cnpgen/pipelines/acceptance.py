@@ -17,8 +17,8 @@ from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, dot, subtract
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.linalg import Scalar, dot, subtract, symbols
+from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -13,7 +13,7 @@ from cnpgen.pipelines.steps import Step, prepare_steps, steps_of, stored_fields,
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
 from cnpgen.store.field import Field
-from cnpgen.symbolic.state import tip_position
+from cnpgen.symbolic.kinematics import tip_position
 
 _EITHER = (("start_q", "start_xyz"), ("goal_q", "goal_xyz"))  # joints or a position
 

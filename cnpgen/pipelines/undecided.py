@@ -14,8 +14,8 @@ from cnpgen.pipelines.context import Context
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint, End
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import Scalar
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.linalg import Scalar, symbols
+from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.planner.expressions import equality_residuals
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.linalg import add, dot, solve
-from cnpgen.symbolic.state import Vec
+from cnpgen.symbolic.linalg import Vec, add, dot, solve
 from cnpgen.trajectory.spline import basis, clamped_knots
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.planner.bending import bend
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import Vec, symbols
+from cnpgen.symbolic.linalg import Vec, symbols
 from cnpgen.trajectory.spline import end_derivatives
 
 if TYPE_CHECKING:

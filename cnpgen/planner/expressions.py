@@ -12,7 +12,8 @@ from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import SymbolicState, Vec, jerk_along, symbols
+from cnpgen.symbolic.linalg import Vec, symbols
+from cnpgen.symbolic.state import SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -13,7 +13,7 @@ from cnpgen.planner.curves import line_bend
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import tip_position
+from cnpgen.symbolic.kinematics import tip_position
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Preparation:
         problem: The problem.
         velocity_limit: Planning limits [rad/s], shape (n,).
         acceleration_limit: Planning limits [rad/s^2], shape (n,).
-        tip: Kernel of ``symbolic.state.tip_position``.
+        tip: Kernel of ``symbolic.kinematics.tip_position``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
     """

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, MachineError
+from cnpgen.errors import DatasetError
 from cnpgen.store.fates import DensityMap
 from cnpgen.store.field import Field
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.picture import new_figure, save_figure
 from cnpgen.store.inspection import Inspection
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.statistics import FieldStatistics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.figure import SubFigure
 
 SHOWN = 300  # rows in the picture from above
 ENOUGH = 25  # draws per cell of a map: shares of fewer say little
@@ -39,13 +39,9 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
     """
     if not inspection.statistics:
         raise DatasetError(f"{inspection.folder} has no rows yet: nothing to draw")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
     joints = _joint_fields(inspection)
     heights = [1.3 * len(joints) + 0.3, 4.2]
-    figure = Figure(figsize=(14, sum(heights) + 0.5), layout="constrained", dpi=110)
+    figure = new_figure(14, sum(heights) + 0.5)
     blueprint = inspection.blueprint
     figure.suptitle(
         f"{blueprint.name} {blueprint.version}, {sum(inspection.rows.values()):,} rows ({inspection.state})"
@@ -53,14 +49,7 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
     parts = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)
     _draw_histograms(parts[0, 0], joints, inspection.statistics)
     _draw_task_space(parts[1, 0], inspection)
-    _save(figure, Path(path))
-
-
-def _save(figure: "Figure", path: Path) -> None:
-    try:
-        figure.savefig(path)
-    except OSError as error:
-        raise machine_error("write", path, error) from error
+    save_figure(figure, Path(path))
 
 
 def _joint_fields(inspection: Inspection) -> list[Field]:

@@ -1,11 +1,15 @@
-"""The small linear algebra of a step, as SX scalars: products, symmetric solves. No branches, no pivoting."""
+"""Small linear algebra as SX scalars, and floats where numbers are known; no branches, no pivoting."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 Scalar = Any  # a CasADi SX of shape (1, 1) or a float
 Vector = Sequence[Scalar]
 Matrix = Sequence[Sequence[Scalar]]
+Vec = list[Scalar]
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
@@ -93,3 +97,36 @@ def inverse3(columns: Matrix) -> list[list[Scalar]]:
     rows = [cross(columns[1], columns[2]), cross(columns[2], columns[0]), cross(columns[0], columns[1])]
     reciprocal = 1.0 / dot(columns[0], rows[0])
     return [scale(row, reciprocal) for row in rows]
+
+
+def symbols(name: str, width: int) -> tuple[Any, Vec]:
+    """Return a fresh SX column of ``width`` symbols and the list of its scalars."""
+    import casadi as ca
+
+    column = ca.SX.sym(name, width)
+    return column, ca.vertsplit(column)
+
+
+def constants(values: NDArray[np.float64]) -> Vec:
+    """Return numbers as a vector that holds no symbols."""
+    return [float(value) for value in values]
+
+
+def rows_of(matrix: NDArray[np.float64]) -> list[Vec]:
+    """Return a matrix of numbers as its rows."""
+    return [constants(row) for row in matrix]
+
+
+def times(matrix: list[Vec], vector: Vec) -> Vec:
+    """Return ``A x`` for the rows of a matrix of three columns."""
+    return [dot(row, vector) for row in matrix]
+
+
+def transposed_times(matrix: list[Vec], vector: Vec) -> Vec:
+    """Return ``A^T x`` for the rows of a 3 x 3 matrix."""
+    return [dot([matrix[row][column] for row in range(3)], vector) for column in range(3)]
+
+
+def product(a: list[Vec], b: list[Vec]) -> list[Vec]:
+    """Return the rows of ``A B`` for those of two 3 x 3 matrices."""
+    return [[dot(row, [b[k][column] for k in range(3)]) for column in range(3)] for row in a]

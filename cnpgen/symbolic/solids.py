@@ -23,9 +23,9 @@ from cnpgen.symbolic.boxes import (
     signed_segment_box_distance,
     upright_box_separation,
 )
-from cnpgen.symbolic.linalg import Scalar, add, dot, scale, subtract
+from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract
 from cnpgen.symbolic.segments import POINT, segment_distance
-from cnpgen.symbolic.state import SymbolicState, Vec
+from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle

@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.errors import MachineError, UsageError
+from cnpgen.errors import UsageError
 from cnpgen.store.files.atomic import committing
+from cnpgen.store.files.picture import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,11 +29,7 @@ def plot_curve(log: str, path: str | Path) -> None:
     steps = [record for record in records if "loss" in record]
     if not steps:
         raise UsageError("the log holds no step: nothing to draw")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
-    figure = Figure(figsize=(12, 7), layout="constrained", dpi=110)
+    figure = new_figure(12, 7)
     axes = figure.subplots(2, 2, sharex=True).ravel()
     _draw_loss(axes[0], steps)
     _draw_terms(axes[1], steps)

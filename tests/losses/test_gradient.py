@@ -8,6 +8,7 @@ import pytest
 
 from cnpgen.losses.plan_loss import LossValue, PlanLoss
 from cnpgen.schema.keys import Range
+from tests.conftest import some
 from tests.examples.jerky import jerky
 from tests.examples.losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
 from tests.examples.manifolds import LIMITS, MANIFOLDS, problem_on
@@ -62,7 +63,7 @@ def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_diffe
     check_along_random_directions(given, of, value, random, **options)
 
 
-@pytest.mark.parametrize("name", sorted(MANIFOLDS))
+@pytest.mark.parametrize("name", some(sorted(MANIFOLDS), 2, "slow"))
 def test_the_gradient_of_every_manifold_is_that_of_central_differences(name):
     of = PlanLoss(problem_on(name), dtype="float64", backend="numpy", nodes=16)
     some, random = batch("transport", 3, by=0.5, seed=1), np.random.default_rng(3)
@@ -73,7 +74,7 @@ def test_the_gradient_of_every_manifold_is_that_of_central_differences(name):
         check_along_random_directions(given, of, value, random, weights=weights_of(of, term))
 
 
-@pytest.mark.parametrize("label", ["hit", "transport"])
+@pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
 def test_the_gradient_of_limited_jerks_is_that_of_central_differences(label):
     of = PlanLoss(jerky(PROBLEM_OF[label])[0], dtype="float64", backend="numpy", nodes=16)
     given, random = batch(label, 3, by=0.3, seed=1), np.random.default_rng(3)

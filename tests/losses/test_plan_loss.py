@@ -16,7 +16,7 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.motion import Motion
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiler, some
 from tests.examples.jerky import jerky
 from tests.examples.losses import PROBLEM_OF, Batch, batch, huber, loss, states, step_losses
 from tests.examples.plans import PROBLEMS
@@ -107,7 +107,7 @@ def test_budgets_and_first_weights_are_those_of_the_problem_file():
     assert of.weights0.tolist() == [constraint.weight for constraint in constraints]
 
 
-@pytest.mark.parametrize("name", PROBLEM_NAMES)
+@pytest.mark.parametrize("name", some(PROBLEM_NAMES, 1, "slow"))
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_without_a_compiler_the_loss_is_the_same_up_to_rounding(name, dtype):
     given = batch(LABEL_OF[name], 5)

@@ -31,7 +31,8 @@ from cnpgen.robots.solid import count_numbers
 from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.linalg import symbols
+from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.state import World
 from tests.examples.constraints import TipSpeed as SpeedOfPlugin
 

@@ -16,7 +16,8 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from cnpgen.symbolic.state import SymbolicState, jerk_along, symbols
+from cnpgen.symbolic.linalg import symbols
+from cnpgen.symbolic.state import SymbolicState, jerk_along
 from cnpgen.world.state import World
 from tests.examples.jerky import jerky
 from tests.examples.plans import PROBLEMS

@@ -14,8 +14,10 @@ from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load import load_problem
 from cnpgen.robots.shape.pairs import segment_distances
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.symbolic.linalg import symbols
 from cnpgen.symbolic.segments import segment_distance
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.state import SymbolicState
+from tests.conftest import some
 from tests.examples.shaped_robot import KINDS, write_problem
 from tests.problems.test_constraint_derivatives import differences
 from tests.problems.test_constraints import Bench
@@ -50,7 +52,7 @@ def room(bench: Bench, constraint: Constraint, q: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", CLEARANCES)
-@pytest.mark.parametrize("form", ["symbolic", "penalised", "symbolic_at"])
+@pytest.mark.parametrize("form", some(["symbolic", "penalised", "symbolic_at"], 1, "slow"))
 def test_what_capsules_clear_is_clear(bench, name, form):
     """Of pairs of links whose capsules are no use, the solvers' forms know nothing."""
     function, condition = symbolic(bench, CLEARANCES[name], form)
@@ -63,7 +65,7 @@ def test_what_capsules_clear_is_clear(bench, name, form):
     assert clear > 50 or (name == "itself" and form != "symbolic_at")
 
 
-@pytest.mark.parametrize("form", ["symbolic", "penalised"])
+@pytest.mark.parametrize("form", some(["symbolic", "penalised"], 1, "slow"))
 def test_what_capsules_clear_of_obstacles_of_every_kind_is_clear(tmp_path, form):
     bench = Bench(load_problem(write_problem(tmp_path, obstacles=KINDS)))
     constraint, tops = CLEARANCES["obstacles"], place_obstacles(bench.problem.obstacle)

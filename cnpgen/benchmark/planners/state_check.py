@@ -12,8 +12,8 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import Scalar, dot
-from cnpgen.symbolic.state import SymbolicState, Vec, symbols
+from cnpgen.symbolic.linalg import Scalar, Vec, dot, symbols
+from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, UsageError
+from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Solid, place_obstacles, solids_of
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.picture import new_figure, save_figure
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
 from cnpgen.world.trace import trace
@@ -58,16 +58,12 @@ def plot_plan(
     """
     if not 0 <= index < len(motion):
         raise UsageError(f"there is no plan {index}, expected 0 to {len(motion) - 1}")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
     one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index)
     if tops is None:
         tops = obstacle_tops(problem, world.tip_position[:, 0], world.tip_position[:, -1])
-    figure = Figure(figsize=(15, 9), layout="constrained", dpi=110)
+    figure = new_figure(15, 9)
     figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
     joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]
     _draw_joints(joints, world, t)
@@ -78,10 +74,7 @@ def plot_plan(
         _draw_over_table(tip, table, world, s, t)
     named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
     tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
-    try:
-        figure.savefig(path)
-    except OSError as error:
-        raise machine_error("write", Path(path), error) from error
+    save_figure(figure, Path(path))
 
 
 def along(

@@ -20,8 +20,8 @@ from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, add, dot, scale
-from cnpgen.symbolic.state import Vec, bias_acceleration, forward_kinematics, symbols, tip_velocity
+from cnpgen.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -25,8 +25,9 @@ from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Box, Solid, count_numbers, height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.symbolic.linalg import symbols
 from cnpgen.symbolic.solids import symbolic_solids
-from cnpgen.symbolic.state import SymbolicState, symbols
+from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.pipelines.stages.hitting_newton import TOLERANCE, Expansion, expand, safeguard, shortened
 from cnpgen.pipelines.stages.stage import Array
-from cnpgen.symbolic.linalg import Scalar, add, dot, factorize, gram, scale, solve, substitute, subtract
-from cnpgen.symbolic.state import Vec, symbols
+from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, factorize, gram, scale, solve, substitute, subtract, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -15,8 +15,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.symbolic.linalg import Scalar, add, cross, dot, factorize, inverse3, scale, substitute, subtract
-from cnpgen.symbolic.state import Kinematics, Vec, forward_kinematics, symbols
+from cnpgen.symbolic.kinematics import Kinematics, forward_kinematics
+from cnpgen.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    cross,
+    dot,
+    factorize,
+    inverse3,
+    scale,
+    substitute,
+    subtract,
+    symbols,
+)
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -22,8 +22,8 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, dot
-from cnpgen.symbolic.state import Vec, forward_kinematics, symbols
+from cnpgen.symbolic.kinematics import forward_kinematics
+from cnpgen.symbolic.linalg import Scalar, Vec, dot, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

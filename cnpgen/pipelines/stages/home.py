@@ -11,7 +11,7 @@ from cnpgen.pipelines.stages.ik import GuessedIK
 from cnpgen.pipelines.stages.stage import Round, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.state import tip_position
+from cnpgen.symbolic.kinematics import tip_position
 
 
 @dataclass(frozen=True, kw_only=True)

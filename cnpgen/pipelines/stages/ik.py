@@ -12,8 +12,8 @@ from cnpgen.pipelines.stages.draw import uniform
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, add, dot, gram, scale, solve, subtract
-from cnpgen.symbolic.state import Kinematics, Vec, forward_kinematics, symbols
+from cnpgen.symbolic.kinematics import Kinematics, forward_kinematics
+from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -11,8 +11,9 @@ from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, add, dot, scale, subtract
-from cnpgen.symbolic.state import Vec, bias_acceleration, forward_kinematics, inverse_dynamics, symbols, tip_velocity
+from cnpgen.symbolic.dynamics import inverse_dynamics
+from cnpgen.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -9,7 +9,8 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.state import inverse_dynamics, symbols
+from cnpgen.symbolic.dynamics import inverse_dynamics
+from cnpgen.symbolic.linalg import symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.state import SymbolicState, jerk_along, symbols
+from cnpgen.symbolic.linalg import symbols
+from cnpgen.symbolic.state import SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

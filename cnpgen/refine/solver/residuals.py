@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import HeldState, jerk_along, symbols
+from cnpgen.symbolic.linalg import symbols
+from cnpgen.symbolic.state import HeldState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -1,0 +1,35 @@
+"""Pictures of matplotlib, which is optional: an empty one to draw in, and the file of one that was drawn."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.errors import MachineError
+from cnpgen.store.files.atomic import machine_error
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
+    """Return an empty picture of a size [inch], whose parts find their places themselves.
+
+    Raises:
+        MachineError: matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
+    return Figure(figsize=(width, height), layout="constrained", dpi=dpi)
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a picture, in the format that the suffix names.
+
+    Raises:
+        MachineError: It cannot be written.
+    """
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise machine_error("write", path, error) from error

@@ -1,0 +1,110 @@
+"""Dynamics of a chain as CasADi SX: recursive Newton-Euler in the frames of its joints."""
+
+from dataclasses import dataclass
+
+from cnpgen.robots.chain import Chain, Joint
+from cnpgen.symbolic.kinematics import joint_rotation
+from cnpgen.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    constants,
+    cross,
+    dot,
+    product,
+    rows_of,
+    scale,
+    times,
+    transposed_times,
+)
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """How the body of a joint moves, in its joint's frame.
+
+    Attributes:
+        rotation: From the joint's frame to the previous one, 3 rows of 3.
+        offset: Origin of the joint's frame in the previous one [m].
+        omega: Angular velocity [rad/s].
+        alpha: Angular acceleration [rad/s^2].
+        acceleration: Acceleration of the origin less gravity [m/s^2].
+    """
+
+    rotation: list[Vec]
+    offset: Vec
+    omega: Vec
+    alpha: Vec
+    acceleration: Vec
+
+
+def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
+    """Motion of every body, the outward recursion of Newton-Euler.
+
+    Args:
+        chain: The chain.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+    """
+    omega: Vec = [0.0, 0.0, 0.0]
+    alpha: Vec = [0.0, 0.0, 0.0]
+    acceleration: Vec = constants(-chain.gravity)
+    motions = []
+    for joint, angle, rate, rate2 in zip(chain.joints, q, dq, ddq, strict=True):
+        rotation = product(rows_of(joint.rotation), joint_rotation(joint, angle))
+        offset = _offset(joint, angle)
+        acceleration = carried(acceleration, omega, alpha, offset)
+        acceleration, omega, alpha = (transposed_times(rotation, x) for x in (acceleration, omega, alpha))
+        axis = constants(joint.axis)
+        if joint.prismatic:
+            coriolis = scale(cross(omega, scale(axis, rate)), 2.0)
+            acceleration = add(acceleration, add(coriolis, scale(axis, rate2)))
+        else:
+            alpha = add(alpha, add(cross(omega, scale(axis, rate)), scale(axis, rate2)))
+            omega = add(omega, scale(axis, rate))
+        motions.append(BodyMotion(rotation, offset, omega, alpha, acceleration))
+    return motions
+
+
+def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
+    """Joint torques [N m] by recursive Newton-Euler, in joint frames.
+
+    Args:
+        chain: The chain.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+    """
+    motions = body_motions(chain, q, dq, ddq)
+    wrenches = [_body_wrench(joint, motion) for joint, motion in zip(chain.joints, motions, strict=True)]
+    force: Vec = [0.0, 0.0, 0.0]
+    moment: Vec = [0.0, 0.0, 0.0]
+    torques: Vec = []
+    for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
+        force, moment = add(force, wrench[0]), add(moment, wrench[1])
+        torques.append(dot(constants(joint.axis), force if joint.prismatic else moment))
+        force = times(motion.rotation, force)
+        moment = add(times(motion.rotation, moment), cross(motion.offset, force))
+    return torques[::-1]
+
+
+def carried(acceleration: Vec, omega: Vec, alpha: Vec, offset: Vec) -> Vec:
+    """Acceleration of a point of a body at ``offset`` from the one that has ``acceleration``."""
+    return add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
+
+
+def _body_wrench(joint: Joint, motion: BodyMotion) -> tuple[Vec, Vec]:
+    """Force and moment about the joint origin that the body of a joint needs for its motion."""
+    com, inertia, omega = constants(joint.com), rows_of(joint.inertia), motion.omega
+    force = scale(carried(motion.acceleration, omega, motion.alpha, com), joint.mass)
+    spin = add(times(inertia, motion.alpha), cross(omega, times(inertia, omega)))
+    return force, add(spin, cross(com, force))
+
+
+def _offset(joint: Joint, angle: Scalar) -> Vec:
+    """Origin of the moved joint frame in the previous frame."""
+    offset = constants(joint.translation)
+    if joint.prismatic:
+        offset = add(offset, scale(constants(joint.rotation @ joint.axis), angle))
+    return offset
