@@ -35,10 +35,16 @@ TINY_SHARD = 250
 HANGING = 1800  # [s] what takes longer hangs, on the slowest machine, too
 
 
-def some(values: Iterable[Any], kept: int = 1) -> list[Any]:
-    """Parameters: the first few in every run, the others, which repeat the claim, in the extended run."""
-    extended = pytest.mark.extended
-    return [value if at < kept else pytest.param(value, marks=extended) for at, value in enumerate(values)]
+def some(values: Iterable[Any], kept: int = 1, mark: str = "extended") -> list[Any]:
+    """Parameters: the first few in every run, the others, which repeat the claim, in the slow or the extended run."""
+    return [value if at < kept else _marked(value, mark) for at, value in enumerate(values)]
+
+
+def _marked(value: Any, mark: str) -> Any:
+    chosen = getattr(pytest.mark, mark)
+    if isinstance(value, type(pytest.param())):
+        return pytest.param(*value.values, marks=(*value.marks, chosen), id=value.id)
+    return pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=chosen)
 
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")

@@ -15,6 +15,7 @@ ALL = tuple(name for name in registry.BUILT_IN[registry.PLANNERS] if name != "cb
 PLANTS = ("nominal", "heavier", "delayed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suite", some(["heavy-100", "hits-81"]))  # tests/cli has hits, too
 def test_every_planner_has_a_row_in_one_table(suite: str, tmp_path: Path) -> None:
     planners = [name for name in ALL if name != "aqp" or suite == "hits-81"]

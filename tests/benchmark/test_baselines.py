@@ -22,6 +22,7 @@ from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem
 from cnpgen.robots.obstacle import Obstacle
+from tests.conftest import some
 
 
 def one_of(suite: str, index: int = 0) -> Plans:
@@ -139,7 +140,7 @@ def test_aqp_plans_hits_only() -> None:
         AQP().prepare(Setting(one_of("heavy-100").problem))
 
 
-@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
 def test_the_paths_of_cbirrt_stay_on_the_manifold_and_are_timed_by_the_velocity_limits(suite: str) -> None:
     """In a process of its own, as in a benchmark: OMPL tells of leaks when its process ends."""
     pytest.importorskip("ompl")

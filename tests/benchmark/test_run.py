@@ -78,6 +78,7 @@ def test_whatever_a_planner_does_costs_its_own_row_only(
     assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
 
 
+@pytest.mark.slow
 def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
@@ -92,6 +93,7 @@ def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path:
     assert "cnp-b, problem 1" in report or "No pictures" in report
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
@@ -119,6 +121,7 @@ def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) ->
     assert "<svg" in report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "engine", ["loky", *(pytest.param(name, marks=pytest.mark.extended) for name in ("dask", "ray"))]
 )
@@ -134,6 +137,7 @@ def test_planners_that_plan_at_once_return_what_one_returns(tmp_path: Path, engi
         assert [row[what] for row in found] == [row[what] for row in alone]
 
 
+@pytest.mark.slow
 def test_results_of_another_run_are_not_mixed_in(tmp_path: Path) -> None:
     run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)
     with pytest.raises(UsageError, match="holds results of another run"):

@@ -32,6 +32,7 @@ from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.forward import forward
 from cnpgen.plans import Plans, open_problem
 from cnpgen.refine.plans import solve_plans
+from tests.conftest import some
 
 PROBLEM_OF = {"hits-81": "airhockey", "heavy-100": "heavy-object"}
 
@@ -170,6 +171,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences_and_the_likel
     assert found == pytest.approx(-logs.sum(axis=1).mean())
 
 
+@pytest.mark.slow
 def test_a_network_that_was_trained_on_plans_proposes_what_is_next_on_them(tmp_path: Path) -> None:
     plans = solve_plans(load_suite("hits-81").problems(9)[0], workers=1).plans
     network = train_proposals(plans, ahead=0.1, steps=300)
@@ -197,7 +199,7 @@ def misses(network: Proposals, plans: Plans) -> float:
     return float(np.linalg.norm(wrong) / np.linalg.norm(far))
 
 
-@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
 def test_the_shipped_networks_propose_what_is_next_on_plans_that_they_have_not_seen(suite: str) -> None:
     network = load_proposals(shipped_proposals(PROBLEM_OF[suite]))
     assert misses(network, solve_plans(load_suite(suite).problems(6)[0], workers=1).plans) < 0.25
@@ -216,7 +218,7 @@ def test_a_network_that_is_missing_or_damaged_is_told_of(tmp_path: Path) -> None
         load_proposals(damaged)
 
 
-@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
 def test_mpc_mpnet_keeps_its_limits_and_gets_away_from_the_start(suite: str) -> None:
     task = one_of(suite, 40)
     robot = open_problem(task.problem)[1]

@@ -12,9 +12,10 @@ from cnpgen.benchmark.suite import list_suites, load_suite
 from cnpgen.errors import RecipeError
 from cnpgen.planner.planner import Planner
 from cnpgen.refine.plans import refine_plans
+from tests.conftest import some
 
 
-@pytest.mark.parametrize("name", ["replan", "feint"])
+@pytest.mark.parametrize("name", some(["replan", "feint"], 1, "slow"))
 def test_a_turn_goes_on_in_position_velocity_and_acceleration(name: str) -> None:
     suite = load_suite(name)
     problems, lead = suite.problems()
@@ -33,6 +34,7 @@ def test_a_turn_goes_on_in_position_velocity_and_acceleration(name: str) -> None
         )
 
 
+@pytest.mark.slow
 def test_the_opposite_puck_is_hit_and_the_first_one_left_alone() -> None:
     pytest.importorskip("mujoco")
     suite = load_suite("feint")

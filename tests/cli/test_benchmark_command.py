@@ -16,6 +16,7 @@ def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture
     assert list(found["plants"]) == ["nominal", "heavier", "delayed"]
 
 
+@pytest.mark.slow
 def test_a_short_benchmark_of_all_planners(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("mujoco")
     planners = ["cnp-b", "cnp-b+refine", "solve", "trajopt", "aqp"]

@@ -182,6 +182,7 @@ def test_the_problem_that_is_given_decides_and_must_be_the_same(run: Run, saved:
 # The picture
 
 
+@pytest.mark.slow
 def test_the_first_plan_that_is_not_valid_is_drawn(run: Run, saved: Callable[[Plans], Path], tmp_path: Path) -> None:
     hit = load("hit")
     file = saved(plans_of(hit, hit.changed(rate=-hit.motion.rate), bent(hit, 0.1), hit))

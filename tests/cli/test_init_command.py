@@ -109,6 +109,7 @@ def test_the_base_configuration_is_ahead_and_links_are_apart_there(crane):
     assert (np.abs(world.holding_torque) < robot.torque_limit).all()
 
 
+@pytest.mark.slow
 def test_the_recipes_of_an_iiwa_make_datasets(tmp_path):
     folder = tmp_path / "striker"
     assert main(["init", str(folder), "--urdf", str(IIWA), "--tip", "striker_tip"]) == 0

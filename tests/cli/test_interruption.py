@@ -74,7 +74,7 @@ def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list
 
 @linux
 @pytest.mark.parametrize("workers", some([2, 1]))
-@pytest.mark.parametrize("number", NAMES)
+@pytest.mark.parametrize("number", some(NAMES, 1, "slow"))
 def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(tmp_path, number, workers):
     folder = tmp_path / "out"
     with making(folder, workers) as process:
@@ -90,6 +90,7 @@ def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(tmp_pa
     assert not (folder / "manifest.json").exists()
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("number", NAMES)
 @pytest.mark.parametrize("seed", some(range(2)))
@@ -106,6 +107,7 @@ def test_a_signal_to_all_processes_while_workers_start_gives_no_traceback(tmp_pa
         assert check_end(process, number, offspring) == ""
 
 
+@pytest.mark.slow
 @linux
 def test_workers_end_where_the_system_has_no_command_to_list_processes(tmp_path, monkeypatch):
     """As in slim container images, where joblib alone fails to kill its workers."""
@@ -120,6 +122,7 @@ def test_workers_end_where_the_system_has_no_command_to_list_processes(tmp_path,
         check_end(process, signal.SIGTERM, offspring)
 
 
+@pytest.mark.slow
 @linux
 def test_a_killed_run_leaves_no_worker_and_only_whole_shards(tmp_path):
     folder = tmp_path / "out"

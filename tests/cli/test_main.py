@@ -355,6 +355,7 @@ def test_an_interruption_is_130_and_says_how_to_go_on(run, monkeypatch, tmp_path
     assert err == "cnpgen: interrupted: finished shards are kept, run the same command again to go on\n"
 
 
+@pytest.mark.slow
 def test_what_a_signal_interrupts_is_kept(tmp_path):
     folder = tmp_path / "many"
     words = ("make-dataset", "airhockey-hit", "--n", "2e6", "--shard-size", "4096", "--workers", "1", "--out", folder)
@@ -487,6 +488,7 @@ def test_inspect_shows_rows_ranges_and_yield(run, hits):
     assert max(len(line) for line in out.splitlines()) <= 100
 
 
+@pytest.mark.slow
 def test_inspect_writes_json_and_a_picture(run, hits, tmp_path):
     code, out, err = run("inspect", hits, "--json", "--plot", tmp_path / "hits.png")
     assert code == 0

@@ -17,7 +17,7 @@ from cnpgen.cli.main import main
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
 from cnpgen.plans.status import PlanStatus
-from tests.conftest import HANGING, columns_of
+from tests.conftest import HANGING, columns_of, some
 
 SMALL = ["--steps", "40", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--workers", "1"]
 
@@ -78,7 +78,7 @@ def test_a_run_that_was_killed_before_its_picture_was_drawn_draws_it_when_it_is_
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("often", [0, 100])
+@pytest.mark.parametrize("often", some([0, 100], 1, "slow"))
 def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):
     monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]) == 0
@@ -145,7 +145,9 @@ def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path
     assert said in load_model(path).training["command"]
 
 
-@pytest.mark.parametrize(("number", "code", "what"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+@pytest.mark.parametrize(
+    ("number", "code", "what"), some([("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")], 1, "slow")
+)
 def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_path, number, code, what):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL[2:], "--steps", "1e5", "--quiet"]
     command = [sys.executable, "-m", "cnpgen", *words]

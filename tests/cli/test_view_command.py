@@ -269,6 +269,7 @@ def test_a_browser_runs_the_page(page):
     assert found.count("<canvas") == 5  # the scene, and four curves
 
 
+@pytest.mark.slow
 @needs_meshcat
 @needs_chromium
 def test_a_browser_draws_the_arm_its_start_and_its_goal(page):

@@ -19,10 +19,10 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
-from tests.conftest import HANGING
+from tests.conftest import HANGING, some
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
 RUNNABLE = {"bash", "python", "toml"}
 
@@ -68,7 +68,7 @@ def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset("airhockey-hit", tmp_path_factory.mktemp("needed") / "hits", n=400, workers=1).folder
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", some(PAGES, 1, "slow"), ids=lambda page: page.name)
 def test_the_blocks_of_a_page_run_in_order(page: Path, needed: Path, tmp_path: Path) -> None:
     for marks, language, text in blocks(page):
         if "needs" in marks and not (tmp_path / marks["needs"]).exists():
@@ -106,6 +106,7 @@ def test_no_two_pages_write_the_same_file_so_that_all_can_run_in_one_folder() ->
     assert {name: names for name, names in pages.items() if len(names) > 1} == {}
 
 
+@pytest.mark.slow
 def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
     source = tmp_path / "src"

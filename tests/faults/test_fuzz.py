@@ -17,6 +17,7 @@ def test_nothing_but_a_result_or_an_error_of_ours(outcome: Outcome) -> None:
     assert outcome.findings == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SUBJECTS)
 def test_files_of_every_kind_were_given(outcome: Outcome, kind: str) -> None:
     assert outcome.read[kind] + outcome.refused[kind] == EACH

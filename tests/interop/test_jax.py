@@ -21,6 +21,8 @@ from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.omega import Omega
 from cnpgen.problems.load import load_problem
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:

@@ -28,6 +28,7 @@ from cnpgen.planner.omega import Omega
 from cnpgen.problems.load import load_problem
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
     pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning"),  # than the machine has cores
 ]

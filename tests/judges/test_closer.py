@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from cnpgen.judges.plans.closer import BOWED, Intervals
+from tests.conftest import some
 from tests.examples.plans import bent, load
 
 judge_module = import_module("cnpgen.judges.plans.judge")  # the package has a function of the same name
 
 
-@pytest.mark.parametrize(("by", "seed"), [(0.0, 0), (0.005, 3), (0.01, 5), (0.02, 2)])
+@pytest.mark.parametrize(("by", "seed"), some([(0.0, 0), (0.005, 3), (0.01, 5), (0.02, 2)], 1, "slow"))
 def test_where_edges_pass_each_other_between_two_moments_the_peak_is_found(
     by: float, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

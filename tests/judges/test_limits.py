@@ -40,6 +40,7 @@ def test_the_margin_of_a_limit_is_the_worst_of_a_very_fine_grid(label: str, quan
     assert margin.time == pytest.approx(np.interp(margin.phase, exact.s, exact.t), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_what_lies_between_moments_counts() -> None:
     """A plan is called valid by no step if its acceleration is beyond what is allowed for a thousandth of a second."""
     plan = bent(jerky_plan("replan"), 0.05, seed=3)

@@ -28,6 +28,7 @@ def test_margins_are_those_of_a_very_fine_grid(label: str, seed: int) -> None:
     assert margins[name].excess == pytest.approx(worst, abs=1e-2 * margins[name].allowed)
 
 
+@pytest.mark.slow
 def test_without_the_closer_look_a_peak_between_moments_would_be_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan that is further off the table than is allowed by a nanometre, between moments 10 ms apart."""
     plan = bent(load("replan"), 0.05, seed=1)

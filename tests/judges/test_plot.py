@@ -16,6 +16,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.trajectory.motion import Motion
+from tests.conftest import some
 from tests.examples.jerky import jerky_plan
 from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import Plan, bent, course, load
@@ -137,6 +138,7 @@ def test_the_arm_of_a_transport_is_as_wide_as_its_capsules(drawn):
             assert np.ptp(points, axis=0).min() >= inside  # a circle of 14 cm at either end
 
 
+@pytest.mark.slow
 def test_the_arm_of_a_shape_is_drawn_by_its_pieces(drawn, tmp_path):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
@@ -149,7 +151,7 @@ def test_the_arm_of_a_shape_is_drawn_by_its_pieces(drawn, tmp_path):
     np.testing.assert_allclose([base.min(axis=0), base.max(axis=0)], [[-0.15, -0.15], [0.15, 0.15]], atol=1e-9)
 
 
-@pytest.mark.parametrize("label", ["hit", "transport"])
+@pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
 def test_legends_are_whole_and_cover_nothing(label, drawn):
     plan = load(label)
     long = replace(plan.robot, joint_names=tuple(f"a_rather_long_name_of_joint_{i}" for i in range(plan.robot.n)))
@@ -185,11 +187,13 @@ def test_a_plan_beyond_its_limits_is_drawn_too(label, by, tmp_path):
     draw(bent(load(label), by), tmp_path / "plan.png")
 
 
+@pytest.mark.slow
 def test_a_plan_that_goes_nowhere_is_drawn(tmp_path):
     plan = load("transport")
     draw(plan.changed(path=0 * plan.motion.path), tmp_path / "plan.png")
 
 
+@pytest.mark.slow
 def test_a_problem_without_a_table_and_obstacles_is_drawn(tmp_path):
     plan = load("hit")
     problem = replace(plan.problem, constraint=plan.problem.constraint[:4])

@@ -17,7 +17,7 @@ from cnpgen.cli.notices import notices
 from cnpgen.errors import MachineError
 from cnpgen.kernels.cache import default_cache_folder, distrusted, distrusted_files, make_private, usable_folder
 from cnpgen.kernels.library import KernelLibrary, choose_backend
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiler, some
 
 posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="files have no owners here")
 BUILT: list[str] = []  # what was built and not found in a cache
@@ -228,7 +228,7 @@ def test_links_are_followed_to_where_they_lead_and_not_at_all_inside(tmp_path):
 
 @needs_compiler
 @posix
-@pytest.mark.parametrize("how", ["open to others", "of another user", "a link"])
+@pytest.mark.parametrize("how", some(["open to others", "of another user", "a link"], 1, "slow"))
 @pytest.mark.parametrize("kind", ["lib", "tape"])
 def test_a_planted_file_is_as_if_it_were_not_there_and_is_replaced(tmp_path, give_away, kind, how):
     folder = tmp_path / "cache"

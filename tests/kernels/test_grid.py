@@ -17,7 +17,7 @@ from cnpgen.kernels.interpreted import BLOCK, InterpretedGridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.mapped import MappedGridKernel
 from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiler, some
 from tests.kernels.test_kernels import BINARY, MEANING, SPECIAL, UNARY, machine_flags
 
 Array = np.ndarray
@@ -276,7 +276,8 @@ def test_minima_and_maxima_with_a_number_ignore_a_nan_though_they_are_one_instru
 @needs_compiler
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="instruction sets of x86-64")
 @pytest.mark.parametrize(
-    ("march", "needs"), [("x86-64", ""), ("sandybridge", "avx"), ("haswell", "avx2"), ("skylake-avx512", "avx512f")]
+    ("march", "needs"),
+    some([("x86-64", ""), ("sandybridge", "avx"), ("haswell", "avx2"), ("skylake-avx512", "avx512f")], 1, "slow"),
 )
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(

@@ -26,7 +26,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.mapped import MappedKernel
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
-from tests.conftest import HANGING, Prepare, needs_compiler
+from tests.conftest import HANGING, Prepare, needs_compiler, some
 from tests.machine.test_workers import alive
 
 Array = np.ndarray
@@ -383,7 +383,8 @@ def machine_flags() -> set[str]:
 @needs_compiler
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="instruction sets of x86-64")
 @pytest.mark.parametrize(
-    ("march", "needs"), [("x86-64", ""), ("sandybridge", "avx"), ("haswell", "avx2"), ("skylake-avx512", "avx512f")]
+    ("march", "needs"),
+    some([("x86-64", ""), ("sandybridge", "avx"), ("haswell", "avx2"), ("skylake-avx512", "avx512f")], 1, "slow"),
 )
 def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
     prepare: Prepare, tmp_path, monkeypatch, march, needs

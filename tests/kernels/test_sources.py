@@ -2,6 +2,7 @@
 
 import ast
 import shutil
+from functools import cache
 from pathlib import Path
 
 import casadi as ca
@@ -26,6 +27,7 @@ MODULES = {
 }
 
 
+@cache
 def imports(module: str) -> set[str]:
     """The package's modules that a module imports at run time, inside functions, too."""
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
@@ -54,11 +56,10 @@ def closure(module: str) -> set[str]:
 
 def makes_functions(module: str) -> bool:
     """Whether a module calls ``casadi.Function``, as builders do."""
-    calls = (
-        node.func
-        for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call)
-    )
+    text = MODULES[module].read_text(encoding="utf-8")
+    if "Function(" not in text:
+        return False
+    calls = (node.func for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
     return any(isinstance(call, ast.Attribute) and call.attr == "Function" for call in calls)
 
 

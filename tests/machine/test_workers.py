@@ -99,6 +99,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @linux
 def test_a_worker_that_is_killed_while_it_sends_a_long_result_keeps_nobody_waiting():
     """It never does: what is long goes through a file. Else the parent would wait for the other half for ever."""
@@ -113,6 +114,7 @@ def long_or_short(size: int) -> bytes:
     return bytes(size)
 
 
+@pytest.mark.slow
 def test_results_of_any_length_come_back_and_leave_no_file_behind(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     sizes = [0, 1000, 2000, 2040, 2048, 2100, 4096, 16_384, 70_000, 3_000_000]
@@ -125,6 +127,7 @@ def test_results_of_any_length_come_back_and_leave_no_file_behind(monkeypatch, t
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @linux
 def test_what_a_killed_process_leaves_is_tidied_up_without_a_word(tmp_path):
     options, pipe = list(sys.warnoptions), subprocess.PIPE
@@ -235,7 +238,7 @@ def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, n
 # --- other backends ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ["threading", "sequential", "multiprocessing"])
+@pytest.mark.parametrize("backend", some(["threading", "sequential", "multiprocessing"], 1, "slow"))
 def test_other_backends_make_the_same_bytes(tiny, tmp_path, backend):
     with joblib.parallel_config(backend=backend):
         make_tiny(tmp_path / "out", workers=4, shard_size=250)

@@ -13,7 +13,7 @@ from cnpgen.store.blueprint import load_blueprint, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
 from cnpgen.validate.dataset import validate_dataset
-from tests.conftest import tiny_recipe
+from tests.conftest import some, tiny_recipe
 from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
 
 DOCUMENTS = ("manifest.json", "stats.json", "README.md", "croissant.json")
@@ -34,7 +34,7 @@ def test_a_finished_dataset_is_left_as_it_is(folder):
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == times
 
 
-@pytest.mark.parametrize("where", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("where", some([0.0, 0.4, 1.0], 1, "slow"))
 @pytest.mark.parametrize("name", ["train/shard-00001.h5", "validation/shard-00000.json"])
 def test_a_flipped_bit_in_a_shard_or_its_record_is_noticed_and_made_good(tiny, folder, name, where):
     flip(folder / name, where)
@@ -47,7 +47,7 @@ def test_a_flipped_bit_in_a_shard_or_its_record_is_noticed_and_made_good(tiny, f
 
 
 @pytest.mark.filterwarnings("ignore:.*(made|written) again:RuntimeWarning")
-@pytest.mark.parametrize("name", ["manifest.json", "stats.json", "train/shard-00000.json"])
+@pytest.mark.parametrize("name", some(["manifest.json", "stats.json", "train/shard-00000.json"], 1, "slow"))
 def test_a_document_of_brackets_is_made_good(tiny, folder, name):
     (folder / name).write_text("[" * 200_000)
     assert make_tiny(folder).complete
@@ -105,7 +105,7 @@ def test_a_shard_whose_record_was_not_written_before_a_run_ended_is_made_without
 
 
 @pytest.mark.parametrize("action", ["flip", "cut", "empty", "delete"])
-@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("name", some(DOCUMENTS, 1, "slow"))
 def test_a_damaged_document_is_noticed_and_written_again(tiny, folder, name, action):
     path = folder / name
     if action == "flip":

@@ -73,6 +73,7 @@ def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(folder:
     assert load_plans(tmp_path / "stored.h5").source == "dataset airhockey-hit-certified, seed 20261121, split train"
 
 
+@pytest.mark.slow
 def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     make_dataset("airhockey-hit", again, n=ROWS, certify=True, part=(1, 2), shard_size=8)
@@ -130,6 +131,7 @@ def test_certifying_adds_one_stage_and_a_name_and_only_once() -> None:
     assert certified(once) is once
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_certified_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["make-dataset", "heavy-object", "--n", "2", "--certify", "--out", str(out), "--workers", "1"]) == 0
@@ -147,6 +149,7 @@ def from_planner(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ).folder
 
 
+@pytest.mark.slow
 def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
     folder: Path, from_planner: Path
 ) -> None:
@@ -164,6 +167,7 @@ def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
     np.testing.assert_allclose(one["duration"], other["duration"], rtol=0.03)
 
 
+@pytest.mark.slow
 def test_transports_begin_with_a_planners_plans_too(tmp_path: Path) -> None:
     made = make_dataset("heavy-object", tmp_path / "out", n=3, certify=True, model="heavy-object", workers=1)
     assert len(open_dataset(made.folder).read("train")["duration"]) == 3

@@ -34,7 +34,7 @@ from tests.examples.tiny_datasets import SHARDS, digests, make_tiny, snapshot
 # --- the same rows however they are made ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 def test_one_worker_and_two_make_the_same_bytes(tiny: Callable[[str], Path], tmp_path, name):
     made = make_tiny(tmp_path / "two", name, workers=2)
     assert (made.made, made.complete) == (660, True)
@@ -254,6 +254,7 @@ def test_a_block_is_drawn_once_however_small_the_shards(tmp_path, rounds, size):
     assert drawn == 3
 
 
+@pytest.mark.slow
 def test_small_shards_have_the_rows_and_counts_of_large_ones(large, tmp_path):
     make_dataset("airhockey-replan", tmp_path / "small", n=20_000, shard_size=500, workers=2)
     for split in ("train", "validation"):

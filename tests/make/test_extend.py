@@ -64,6 +64,7 @@ def test_an_extended_dataset_has_the_rows_of_one_made_at_once_beside_shards_that
             np.testing.assert_array_equal(values, larger[name])
 
 
+@pytest.mark.slow
 def test_it_is_proven_like_any_other_and_its_documents_are_of_all_rows(grown, at_once):
     report = validate_dataset(grown, deep=True, regenerate=10)
     assert report.ok, report.findings
@@ -104,6 +105,7 @@ def test_the_same_call_again_and_the_recipe_of_that_size_leave_it_as_it_is(grown
     assert snapshot(grown) == before
 
 
+@pytest.mark.slow
 def test_it_can_be_extended_again_and_damaged_shards_of_any_age_are_made_again(grown, tmp_path):
     folder = shutil.copytree(grown, tmp_path / "airhockey-hit")
     assert extend_dataset(folder, 1500, workers=1).complete

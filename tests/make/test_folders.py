@@ -20,7 +20,7 @@ from cnpgen.make.dataset import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.blueprint import load_blueprint
 from cnpgen.validate.dataset import validate_dataset
-from tests.conftest import TINY_SHARD, tiny_recipe
+from tests.conftest import TINY_SHARD, some, tiny_recipe
 from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
 
 
@@ -132,7 +132,7 @@ def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, conte
     assert validate_dataset(folder).ok
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"garbage", None])
+@pytest.mark.parametrize("content", some([b"", b"{", b"garbage", None], 2, "slow"))
 def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, content):
     if content is None:
         flip(folder / "plan.json")
@@ -321,6 +321,7 @@ def test_a_folder_that_is_deleted_while_the_dataset_is_made_is_said_to_be_that(t
         make_tiny(out, progress=lambda *_: (out / "plan.json").unlink())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are Unicode here")
 def test_a_folder_whose_name_is_not_utf_8_is_like_any_other(tiny, tmp_path):
     out = tmp_path / os.fsdecode(b"d\xff")

@@ -88,6 +88,7 @@ def running(folder: Path, *, workers: int, shard_size: int = TINY_SHARD) -> Iter
             process.kill()
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("workers", some([2, 1]))
 def test_a_killed_run_is_finished_with_the_same_bytes(tiny, tmp_path, workers):
@@ -104,6 +105,7 @@ def test_a_killed_run_is_finished_with_the_same_bytes(tiny, tmp_path, workers):
     assert not (folder / "_work").exists()
 
 
+@pytest.mark.slow
 @linux
 def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
     killed: list[int] = []
@@ -128,7 +130,7 @@ def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
     assert digests(folder) == digests(tmp_path / "uncut")
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+@pytest.mark.parametrize("number", some([errno.ENOSPC, errno.EDQUOT, errno.EROFS], 1, "slow"))
 def test_a_full_disk_is_a_machine_error_and_the_dataset_is_finished_later(tiny, tmp_path, monkeypatch, number):
     folder, calls, flush = tmp_path / "out", [], os.fsync
 

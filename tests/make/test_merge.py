@@ -13,6 +13,7 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.merge import merge_datasets
 from cnpgen.store.files import atomic
 from cnpgen.validate.dataset import validate_dataset
+from tests.conftest import some
 from tests.examples.tiny_datasets import SHARDS, digests, flip, make_tiny, snapshot
 
 
@@ -103,12 +104,16 @@ def test_gaps_overlaps_and_damage_are_refused_by_name(parts, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "text"),
-    [
-        ({"seed": 3}, "seed 3 instead of 2026"),
-        ({"dtype": "float32"}, "dtype float32 instead of float64"),
-        ({"name": "airhockey-replan"}, "another recipe"),
-        ({"n": 700}, "{'train': 637, 'validation': 63} rows instead of {'train': 600, 'validation': 60}"),
-    ],
+    some(
+        [
+            ({"seed": 3}, "seed 3 instead of 2026"),
+            ({"dtype": "float32"}, "dtype float32 instead of float64"),
+            ({"name": "airhockey-replan"}, "another recipe"),
+            ({"n": 700}, "{'train': 637, 'validation': 63} rows instead of {'train': 600, 'validation': 60}"),
+        ],
+        1,
+        "slow",
+    ),
 )
 def test_a_part_of_another_dataset_is_refused_by_name(made, tmp_path, options, text):
     other = make_tiny(tmp_path / "other", part=(2, 3), **options).folder

@@ -99,12 +99,14 @@ def test_another_file_or_a_model_of_another_problem_is_refused(first) -> None:
         load_stage_planner("airhockey-hot", "0" * 64, context)
 
 
+@pytest.mark.slow
 def test_the_shipped_dataset_is_what_it_says(tiny) -> None:
     report = validate_dataset(tiny("airhockey-onthefly"), deep=True, workers=1)
     assert report.ok, report.summary()
     assert "hitting configuration" in report.summary()
 
 
+@pytest.mark.slow
 def test_goals_that_many_rows_have_are_not_taken_for_hits_that_were_slowed_down() -> None:
     drawn = draw_boundary_problems("airhockey-onthefly", 3000, seed=7)
     _, count = np.unique(drawn.boundary.goal_q, axis=0, return_counts=True)

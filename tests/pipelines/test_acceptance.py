@@ -131,6 +131,7 @@ def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
     assert [float(count(value)) > 0 for value in (1.6, -1.6)] == [bool(upper < 1.6), bool(lower > -1.6)]
 
 
+@pytest.mark.slow
 def test_torques_beyond_their_limits_are_rejected(prepare: Prepare, rounds):
     for name in ("airhockey-replan", "heavy-object"):
         prepared, draws = rounds[name]

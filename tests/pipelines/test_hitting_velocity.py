@@ -8,7 +8,7 @@ from scipy.optimize import linprog
 
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity, hitting_velocity
 from cnpgen.pipelines.stages.stage import Round
-from tests.conftest import Arm, Prepare, needs_compiler, run_stages
+from tests.conftest import Arm, Prepare, needs_compiler, run_stages, some
 
 Array = np.ndarray
 HALF = np.sqrt(0.5)
@@ -71,7 +71,7 @@ def solve(prepared, backend: str, cases: list[tuple[Array, Array]], kernels_of) 
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", some(KINDS, 1, "slow"))
 def test_velocities_are_the_optimum_that_highs_finds(prepare: Prepare, kernels_of, kind, backend):
     prepared = prepare("airhockey-hit")
     cases = states(kind, prepared.context.robot)
@@ -96,7 +96,7 @@ def test_there_are_more_than_500_states_and_many_are_degenerate(prepare: Prepare
         assert np.abs(odd).max() < 1e-12  # three columns of the equations are parallel
 
 
-@pytest.mark.parametrize("offset", [1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3])
+@pytest.mark.parametrize("offset", some([1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3], 2, "slow"))
 def test_almost_degenerate_states_are_optimal_by_duality(prepare: Prepare, kernels_of, fastest, offset):
     """HiGHS' own tolerance is too coarse here: what a feasible v reaches and no v can exceed is the optimum.
 

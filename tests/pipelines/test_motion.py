@@ -112,6 +112,7 @@ def test_small_torque_limits_are_what_bounds_the_acceleration(weak, moving):
     assert np.mean(np.abs(strong - ddq).max(0) > 1e-6) > 0.2
 
 
+@pytest.mark.slow
 def test_draws_that_cannot_be_accelerated_within_tiny_torque_limits_are_rejected_and_counted(prepare: Prepare):
     """Holding still takes more than these limits: no acceleration is left."""
     prepared = prepare(with_torque_scale(prepare("airhockey-replan").pipeline, 0.02), "numpy")
@@ -123,6 +124,7 @@ def test_draws_that_cannot_be_accelerated_within_tiny_torque_limits_are_rejected
         assert np.all(np.abs(arm.torque(*state)) <= robot.torque_limit * (1 + 1e-12))
 
 
+@pytest.mark.slow
 def test_an_acceleration_at_the_goal_is_drawn_the_same_way(prepare: Prepare):
     pipeline = prepare("airhockey-replan").pipeline
     prepared = prepare(replace(pipeline, stage=(*pipeline.stage, TableAcceleration(end="goal"))), "numpy")

@@ -13,7 +13,7 @@ from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
 from cnpgen.store.fates import Fates, merge_fates
 from cnpgen.store.field import Field
-from tests.conftest import SHIPPED, Prepare, needs_compiler
+from tests.conftest import SHIPPED, Prepare, needs_compiler, some
 
 CLOSE = 1e-9  # SI: what backends may differ by
 SEED = 20261121
@@ -211,7 +211,7 @@ def same_round(prepared: PreparedPipeline, size: int) -> Round:
     return prepared._round(random_generator(SEED, "train", 0), size)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 @pytest.mark.parametrize(("backend", "size"), [pytest.param("compiled", 6000, marks=needs_compiler), ("casadi", 300)])
 def test_backends_agree_on_the_same_draws(prepare: Prepare, name, backend, size):
     """But for draws on the verge of being rejected and for searches that end in another of two equal optima."""

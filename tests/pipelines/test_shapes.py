@@ -117,6 +117,7 @@ def test_the_capsules_clearance_is_a_lower_bound(context, drawn):
     assert (clearance[0] > 0).mean() > 0.2
 
 
+@pytest.mark.slow
 def test_scenes_of_the_same_kinds_need_no_other_kernels(tmp_path: Path):
     """Where obstacles are and how large is none of the kernels' business."""
     found = []
@@ -132,6 +133,7 @@ def test_scenes_of_the_same_kinds_need_no_other_kernels(tmp_path: Path):
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("collision", ["", COLLISION])
 @pytest.mark.parametrize("obstacles", [OBSTACLES, KINDS], ids=["boxes", "kinds"])
 def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, prepare: Prepare, collision, obstacles):

@@ -16,7 +16,7 @@ from cnpgen.problems.load import load_problem
 from cnpgen.problems.record import record_problem
 from cnpgen.refine.plans import refine_plans
 from cnpgen.trajectory.boundary import Boundary
-from tests.conftest import columns_of
+from tests.conftest import columns_of, some
 from tests.examples.models import boundary_of_columns, untrained_model
 
 
@@ -70,7 +70,7 @@ def test_tip_positions_are_those_of_pinocchio(planner, rows):
         np.testing.assert_allclose(plans.columns[f"{end}_xyz"], plans.problem.tip_positions(q), atol=1e-12)
 
 
-@pytest.mark.parametrize("part", [0.1, 0.6, 0.9, 0.99])
+@pytest.mark.parametrize("part", some([0.1, 0.6, 0.9, 0.99], 1, "slow"))
 def test_replanning_to_a_goal_that_has_not_moved_never_takes_longer_than_what_was_left(part):
     planner, rows = Planner("airhockey-replan"), draw_boundary_problems("airhockey-replan", 8, seed=21).boundary
     old = refine_plans(planner.plan_batch(rows), workers=1).plans
@@ -222,7 +222,7 @@ def test_no_tasks_are_no_plans(planner, rows):
     assert len(planner.plan_batch(rows[:0])) == 0
 
 
-@pytest.mark.parametrize("backend", ["numpy", "casadi"])
+@pytest.mark.parametrize("backend", some(["numpy", "casadi"], 1, "slow"))
 def test_plans_are_the_same_on_every_backend(planner, rows, backend):
     other = Planner(planner.model, backend=backend)
     np.testing.assert_allclose(

@@ -65,6 +65,7 @@ def test_plans_in_memory_and_in_a_file_get_one_verdict_where_a_tip_position_was_
     assert evaluate_plans(right).plans is right
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cnpgen.plans.evaluate, "PART", 3)
     plans = plans_of(*(plan for plan, _ in garbage().values()))

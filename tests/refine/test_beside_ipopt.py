@@ -17,6 +17,7 @@ more = pytest.mark.extended  # the same claim of another motion
 PROBLEMS = {"hit": "airhockey", "replan": "airhockey", "transport": "heavy-object"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["hit", pytest.param("replan", marks=more)])
 def test_a_pass_ends_at_least_as_good_as_ipopts_from_the_same_start(label: str) -> None:
     asked, tool = task(load(label)), refiner(PROBLEMS[label])

@@ -16,6 +16,7 @@ from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.plans import refine_plans
 from tests.cli.test_interruption import descendants
+from tests.conftest import some
 from tests.refine.test_plans import same
 
 N = 14
@@ -39,6 +40,7 @@ def kill_workers(_plans: int, _valid: int) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
+@pytest.mark.slow
 @linux
 def test_what_was_finished_before_a_worker_was_killed_is_not_made_again(
     problems: Plans, solved: Plans, tmp_path: Path
@@ -55,7 +57,7 @@ def test_what_was_finished_before_a_worker_was_killed_is_not_made_again(
     assert same(found.plans, solved)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+@pytest.mark.parametrize("number", some([errno.ENOSPC, errno.EDQUOT], 1, "slow"))
 def test_a_disk_that_is_full_is_told_with_what_to_do_and_what_fits_counts(
     problems: Plans, solved: Plans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
@@ -86,6 +88,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize(("limit", "workers"), [(12_000, "2"), (30_000, "1")])
 def test_a_file_that_cannot_grow_is_one_line_and_the_same_command_goes_on(

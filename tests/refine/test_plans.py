@@ -363,6 +363,7 @@ def test_bad_arguments_are_one_line_and_leave_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
 @pytest.mark.parametrize("number", some([signal.SIGKILL, signal.SIGTERM]))
 def test_a_killed_solve_loses_nothing_that_was_finished(number: int, hits: Plans, tmp_path: Path) -> None:

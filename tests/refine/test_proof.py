@@ -21,6 +21,7 @@ from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, jo
 from cnpgen.refine.proof.table_proof import table_bounds
 from cnpgen.refine.proof.tip_bound import Arm, bound_projection
 from cnpgen.trajectory.boundary import Boundary
+from tests.conftest import some
 from tests.examples.plans import ROBOTS, Plan, load, raised
 from tests.examples.refiner import refine
 
@@ -66,7 +67,9 @@ def test_nothing_is_proven_about_a_problem_with_a_valid_plan(label: str) -> None
     assert explain(load(label)).kind is Feasibility.UNKNOWN
 
 
-@pytest.mark.parametrize(("name", "count"), [("airhockey-replan", 3), ("airhockey-hit", 3), ("heavy-object", 1)])
+@pytest.mark.parametrize(
+    ("name", "count"), some([("airhockey-replan", 3), ("airhockey-hit", 3), ("heavy-object", 1)], 1, "slow")
+)
 def test_no_solved_problem_is_called_infeasible(name: str, count: int) -> None:
     plans = solved(name, count)
     found = explain_plans(plans, range(len(plans)))
@@ -91,13 +94,17 @@ def off_the_height(plan: Plan, by: float) -> Plan:
 
 @pytest.mark.parametrize(
     ("plan", "always"),
-    [
-        (mirrored(at_the_edge(0.0145, 1.0)), False),
-        (mirrored(at_the_edge(0.015, 1.0)), True),
-        (at_the_edge(0.016, 1.0), True),
-        (off_the_height(at_the_edge(0.016, 1.0), 3e-3), True),
-        (off_the_height(at_the_edge(0.016, 1.0), -4e-3), True),
-    ],
+    some(
+        [
+            (mirrored(at_the_edge(0.0145, 1.0)), False),
+            (mirrored(at_the_edge(0.015, 1.0)), True),
+            (at_the_edge(0.016, 1.0), True),
+            (off_the_height(at_the_edge(0.016, 1.0), 3e-3), True),
+            (off_the_height(at_the_edge(0.016, 1.0), -4e-3), True),
+        ],
+        2,
+        "slow",
+    ),
     ids=["goal on the verge", "goal", "start", "above", "below"],
 )
 def test_proofs_about_solved_problems_at_the_edge_are_tried_and_fail(
@@ -190,6 +197,7 @@ def test_the_same_at_the_goal() -> None:
     assert "before the goal the tip is" in finding.text
 
 
+@pytest.mark.slow
 def test_with_more_room_the_proof_gives_way_to_the_verge_and_then_to_nothing() -> None:
     kinds = [explain_case(at_the_edge(clearance, speed=1.0)).kind for clearance in (0.012, 0.014, 0.016)]
     assert kinds == [Feasibility.INFEASIBLE, Feasibility.VERGE, Feasibility.UNKNOWN]

@@ -31,6 +31,7 @@ def valid_states(plans: Plans, step: float = 1e-3) -> list[np.ndarray]:
     return [states(plans, index, step) for index, verdict in enumerate(verdicts) if verdict.valid]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("obstacles", some([KINDS, OBSTACLES]), ids=["kinds", "boxes"])
 def test_valid_plans_touch_nothing(tmp_path, obstacles):
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles))

@@ -27,6 +27,7 @@ from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import chebyshev
 from cnpgen.world.state import World
+from tests.conftest import some
 from tests.examples.constraints import TipSpeed
 from tests.examples.plans import PROBLEMS, Plan, load, raised
 from tests.examples.refiner import library, refine, refiner, refiner_of, task, tops, verdict
@@ -48,7 +49,7 @@ def duration(found: Refined) -> float:
     return float(Motion(found.path[None], found.rate[None]).duration()[0])
 
 
-@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("label", some(LABELS, 1, "slow"))
 @pytest.mark.parametrize(
     ("kind", "goal_acceleration"),
     [(None, False), (None, True), ("centrifugal", True), ("effort", False), ("jerk", True)]
@@ -164,7 +165,7 @@ def test_a_start_off_the_table_by_what_the_verdict_allows_is_planned_in_the_firs
     assert verdict(plan, plan.boundary, found.path, found.rate).valid
 
 
-@pytest.mark.parametrize("band", [5e-3, 0.0])
+@pytest.mark.parametrize("band", some([5e-3, 0.0], 1, "slow"))
 def test_a_plan_from_further_off_the_table_than_the_start_band_is_not_valid(band: float) -> None:
     high = raised(load("hit"), 0.2)
     allowed = high.with_constraint("Table", start_band=0.2)
@@ -456,6 +457,7 @@ def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radiu
     assert model.solve(held, np.full(motion.nx, radius), relax=True).left <= step.left + 1e-6
 
 
+@pytest.mark.slow
 def test_a_slow_down_is_as_large_as_the_bound_asks_for_whatever_its_size(tmp_path: Path) -> None:
     plan = load("transport")
     states = plan.motion.at(np.linspace(0, 1, 500))

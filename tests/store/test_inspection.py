@@ -151,11 +151,13 @@ def test_a_dataset_is_drawn(hits, tmp_path, suffix):
     assert (tmp_path / f"hits.{suffix}").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_an_unfinished_dataset_is_drawn(unfinished, tmp_path):
     plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
     assert (tmp_path / "hits.png").exists()
 
 
+@pytest.mark.slow
 def test_a_density_map_over_a_single_point_is_drawn(hits, tmp_path, monkeypatch):
     found = inspect_dataset(hits)
     density = DensityMap((0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64))
@@ -170,7 +172,7 @@ def test_nothing_to_draw_is_said(unfinished, tmp_path):
         plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
 
 
-@pytest.mark.parametrize(("draws", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
+@pytest.mark.parametrize(("draws", "cells"), some([(200, 2), (2_000, 8), (100_000, 24)], 1, "slow"))
 def test_cells_of_a_map_hold_enough_draws_to_say_something(draws, cells, hits, tmp_path, monkeypatch):
     random = np.random.default_rng(0)
     drawn = np.bincount(random.integers(0, 24 * 24, draws), minlength=24 * 24).reshape(24, 24)

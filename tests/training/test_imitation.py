@@ -60,6 +60,7 @@ def test_its_gradient_is_that_of_finite_differences():
     np.testing.assert_allclose(slope, found, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_network_boundary_and_distance_together_have_the_gradient_of_finite_differences(tiny):
     boundary = boundary_of_columns(columns_of(tiny("airhockey-replan")), 6)
     learner, rows = learner_of("airhockey", boundary, dtype="float64", settings=UNCLIPPED)
@@ -97,6 +98,7 @@ def test_a_run_imitates_first_and_then_goes_on_with_the_loss(shown, tmp_path):
     assert losses == list(range(304, 401, 4))
 
 
+@pytest.mark.slow
 def test_an_imitating_run_that_was_cut_goes_on_exactly(shown, tmp_path, monkeypatch):
     from tests.training.test_run import CutOffError, checkpoints, cut_at
 

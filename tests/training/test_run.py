@@ -23,7 +23,7 @@ from cnpgen.planner.model_file import load_model
 from cnpgen.store.files.leftovers import temporary_name
 from cnpgen.training import checkpoint as checkpoints
 from cnpgen.training.train import Trained, train_model
-from tests.conftest import tiny_recipe
+from tests.conftest import some, tiny_recipe
 from tests.examples.models import SMALL
 
 STEPS, JUDGED = 30, 6
@@ -70,7 +70,9 @@ def lines(model: Model) -> list[dict[str, Any]]:
     return [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in model.log.splitlines()]
 
 
-@pytest.mark.parametrize("metric", [SMALL.metric, replace(BOUNDED, every="batch")], ids=["ramped", "learned"])
+@pytest.mark.parametrize(
+    "metric", some([SMALL.metric, replace(BOUNDED, every="batch")], 1, "slow"), ids=["ramped", "learned"]
+)
 def test_a_run_that_was_cut_and_resumed_gives_the_bits_and_the_log_of_an_uncut_one(train, uncut, metric):
     settings = replace(SMALL, metric=metric)
     whole = uncut if metric == SMALL.metric else train("whole.h5", settings=settings)
@@ -181,7 +183,7 @@ def test_whole_numbers_of_numpy_make_the_same_run(train):
     assert not train(settings=replace(SMALL, seed=2)).made
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], 1, "slow"))
 def test_a_signal_saves_the_run_after_the_step_that_it_came_in(train, uncut, number):
     before, steps = signal.signal(number, signal.default_int_handler), []
 
@@ -203,6 +205,7 @@ def test_a_signal_saves_the_run_after_the_step_that_it_came_in(train, uncut, num
     assert lines(cut.model) == lines(uncut.model)
 
 
+@pytest.mark.slow
 def test_force_goes_on_with_its_own_checkpoint_and_throws_away_another_one(train):
     begun = []
     with pytest.raises(CutOffError):
@@ -251,7 +254,7 @@ def dying(*_: Any) -> None:
     raise CutOffError
 
 
-@pytest.mark.parametrize("left", [None, b"", b'{"step": 1'])
+@pytest.mark.parametrize("left", some([None, b"", b'{"step": 1'], 1, "slow"))
 def test_a_resumed_run_has_its_whole_log_whatever_became_of_the_file(train, uncut, tmp_path, left):
     with pytest.raises(CutOffError):
         train("cut.h5", watch=cut_at(20))
@@ -273,7 +276,7 @@ def test_the_log_is_never_half_written_over(train, tmp_path, monkeypatch):
     assert (tmp_path / "model.jsonl").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["model.jsonl", "model.png"])
+@pytest.mark.parametrize("name", some(["model.jsonl", "model.png"], 1, "slow"))
 def test_files_of_others_beside_the_model_are_not_replaced_without_force(train, tmp_path, name):
     path = tmp_path / name
     path.write_text('{"step": 1, "my": "data"}\n')
@@ -283,6 +286,7 @@ def test_files_of_others_beside_the_model_are_not_replaced_without_force(train, 
     assert train(force=True).made
 
 
+@pytest.mark.slow
 def test_the_log_and_the_picture_of_a_run_are_replaced_by_those_of_the_next_one(train, tmp_path):
     train()
     (tmp_path / "model.h5").unlink()
@@ -322,6 +326,7 @@ def test_a_dataset_without_a_second_split_cannot_be_validated_on(tmp_path):
         train_model(tmp_path / "one", tmp_path / "model.h5", steps=2, settings=SMALL)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_its_checkpoint_was(train, tiny, tmp_path):
     code = f"""
 from pathlib import Path

@@ -73,6 +73,7 @@ def test_a_plan_without_a_loss_takes_no_part_in_the_gradient_of_the_others(tiny)
     np.testing.assert_allclose(gradient, expected * 5 / 6, rtol=1e-7, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_no_sample_counts_more_than_the_limit_allows(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
     clipped = replace(learner, settings=replace(UNCLIPPED, sample_clip=1.0))

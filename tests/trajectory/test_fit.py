@@ -12,6 +12,7 @@ from cnpgen.trajectory.fit import fit_motion, largest_error
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.samples import sampled_boundary
 from cnpgen.trajectory.spec import TrajectorySpec
+from tests.conftest import some
 
 SPEC = TrajectorySpec()
 Curve = Callable[[np.ndarray], np.ndarray]
@@ -55,7 +56,7 @@ def test_a_quintic_is_fitted_exactly_with_phase_proportional_to_time() -> None:
     assert motion.duration()[0] == pytest.approx(0.7, rel=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", some(range(4), 1, "slow"))
 def test_a_motion_of_the_family_is_found_again(seed: int) -> None:
     motion, boundary = own_motion(seed)
     t = np.linspace(0, 0.5, 501)
@@ -177,6 +178,7 @@ def test_other_degrees_and_numbers_of_control_points(spec: TrajectorySpec) -> No
     assert largest_error(motion, t, q) < 5e-3
 
 
+@pytest.mark.slow
 def test_many_samples_and_long_motions() -> None:
     t = np.linspace(0, 1e4, 20_001)
     q = np.column_stack([np.sin(3e-4 * t), trapezoid(t / 1e4)[:, 0]])

@@ -12,6 +12,7 @@ from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.motion import Motion, States
 from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import clamped_knots, extremes
+from tests.conftest import some
 
 FIELDS = tuple(States.__annotations__)
 
@@ -168,7 +169,7 @@ def test_motions_that_stop_or_go_back_last_for_ever() -> None:
     assert np.isnan(T[6])
 
 
-@pytest.mark.parametrize("lowest", [1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("lowest", some([1e-2, 1e-3, 1e-4, 1e-5], 1, "slow"))
 def test_a_rate_that_comes_close_to_zero_on_the_way_has_the_duration_that_adaptive_quadrature_finds(
     lowest: float,
 ) -> None:

@@ -64,7 +64,7 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
 # --- good datasets ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", some(["float64", "float32"], 1, "slow"))
 @pytest.mark.parametrize("name", SHIPPED)
 def test_what_was_made_is_valid_to_the_last_row_and_made_again_to_the_bit(tiny: Tiny, tmp_path, name, dtype):
     folder = tiny(name)
@@ -89,6 +89,7 @@ def test_thousands_of_float32_rows_are_valid(tmp_path):
         assert report.ok, report.summary()
 
 
+@pytest.mark.slow
 def test_one_worker_and_two_report_the_same(tiny: Tiny):
     one, two = (validate_dataset(tiny("airhockey-hit"), deep=True, workers=workers) for workers in (1, 2))
     assert one.to_dict() == two.to_dict()
@@ -182,7 +183,7 @@ def test_a_cut_off_file_is_named(damaged: Path, file, keep):
     assert file in named(report)
 
 
-@pytest.mark.parametrize("file", KINDS)
+@pytest.mark.parametrize("file", some(KINDS, 2, "slow"))
 def test_damaged_files_are_findings_and_not_exceptions_however_much_is_asked_for(damaged: Path, file):
     """Also where the damage keeps the size, so that a shard seems to be there."""
     whole = bytearray((damaged / file).read_bytes())
@@ -270,7 +271,9 @@ WRONG = [
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "check"), WRONG, ids=[f"{index} {check}" for index, (_, _, check) in enumerate(WRONG)]
+    ("name", "change", "check"),
+    some(WRONG, 5, "slow"),
+    ids=[f"{index} {check}" for index, (_, _, check) in enumerate(WRONG)],
 )
 def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(tiny: Tiny, tmp_path, name, change, check):
     folder = copied(tiny, tmp_path, name)

@@ -14,7 +14,7 @@ from cnpgen.store.record import ShardRecord, load_record
 from cnpgen.store.shard import read_shard
 from cnpgen.store.statistics import column_statistics
 from cnpgen.validate.numbers import check_numbers
-from tests.conftest import SHIPPED, TINY_SHARD, tiny_recipe
+from tests.conftest import SHIPPED, TINY_SHARD, some, tiny_recipe
 
 Columns = dict[str, np.ndarray]
 Parts = tuple[Blueprint, ShardTask, Columns, ShardRecord]
@@ -42,7 +42,7 @@ def changed(shard: Parts, name: str, where: Any, value: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", some(["float64", "float32"], 1, "slow"))
 def test_nothing_is_wrong_with_what_was_made(tiny, tmp_path, name, dtype):
     folder = tiny(name)
     if dtype == "float32":

@@ -13,6 +13,7 @@ from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.world.path import PathWorld
 from cnpgen.world.scene import Scene
 from cnpgen.world.state import World
+from tests.conftest import some
 from tests.examples.meshes import Meshes
 from tests.examples.obstacles import KINDS, ROUNDER, coal_distance, draw_obstacle, segment
 from tests.examples.shaped_robot import KINDS as AMONG_KINDS
@@ -22,7 +23,7 @@ from tests.problems.test_constraints import gantry_problem
 SIZE = (0.2, 0.14, 0.3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", some(KINDS, 3, "slow"))
 def test_segments_and_objects_are_as_far_away_as_coal_s_own_shapes_say(kind: str) -> None:
     random, inside = np.random.default_rng(3), 0
     for _ in range(10):

@@ -49,6 +49,7 @@ def test_the_puck_and_the_arm_are_seen_in_the_robots_frame(plans: Plans) -> None
     assert np.linalg.norm(at_the_hit - plans.columns["goal_xyz"][0]) < 0.002
 
 
+@pytest.mark.slow
 def test_a_benchmark_executes_there_too(tmp_path: Path) -> None:
     found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, environment=CLONE, workers=1)
     assert found.executions == ("challenge",)
@@ -56,6 +57,7 @@ def test_a_benchmark_executes_there_too(tmp_path: Path) -> None:
     assert "executed by the challenge plant" in save_benchmark_report(found, tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_command_line_executes_there_and_refuses_what_is_no_clone(plans: Plans, tmp_path: Path) -> None:
     save_plans(tmp_path / "plans.h5", plans[:1])
 

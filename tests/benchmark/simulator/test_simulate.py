@@ -125,6 +125,7 @@ def test_an_object_dragged_through_a_pedestal_collides() -> None:
     assert not executed.success
 
 
+@pytest.mark.slow
 def test_two_processes_execute_as_one_does(hit: Plans) -> None:
     plans = concatenate([hit] * 3)
     one, two = (simulate_plans(plans, workers=workers).executed for workers in (1, 2))
