@@ -116,6 +116,15 @@ def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.
     assert {{"pinocchio": "pin"}.get(name, name) for name in others} <= libraries
 
 
+def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lands() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pytest"]["ini_options"]
+    assert settings["addopts"][-2:] == ["-m", "not slow and not extended"]
+    assert {text.partition(":")[0] for text in settings["markers"]} == {"slow", "extended"}
+    command, script = "-m 'slow and not extended'", ROOT / ".ci" / "run"
+    assert command in (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert not script.exists() or command in script.read_text(encoding="utf-8")  # a source distribution has none
+
+
 def test_no_code_lives_beside_the_package() -> None:
     for folder in ("problems", "pipelines", "datasets"):
         assert not list((ROOT / folder).rglob("*.py"))

@@ -69,7 +69,6 @@ def test_without_a_rule_goals_are_anybodys(rows: tuple[Columns, HitRule]) -> Non
     assert not {"hitting configuration", "hitting velocity"} & names
 
 
-@pytest.mark.slow
 def test_another_configuration_at_the_same_place_is_found(rows: tuple[Columns, HitRule]) -> None:
     """The arm is moved where its tip stays, and everything that follows from it is made right again."""
     columns, rule = rows

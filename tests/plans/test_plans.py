@@ -766,6 +766,7 @@ def test_plans_are_made_of_tensors_that_carry_gradients() -> None:
     assert_equal(make_plans(AIRHOCKEY, boundary, **given), plans)
 
 
+@pytest.mark.slow
 def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
     jnp, torch = pytest.importorskip("jax.numpy"), pytest.importorskip("torch")
     plans = draw_plans()
