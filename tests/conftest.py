@@ -6,7 +6,7 @@ import os
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
     os.environ[_variable] = "1"  # before NumPy is imported: its result must not depend on the machine's load
 os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: workers only where a test asks for them
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of processes would compile the whole package, each for itself
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of processes would compile the whole package each
 
 import shutil
 import signal
