@@ -43,7 +43,24 @@ typedef long long integer;
 #define MANTISSA 52
 #endif
 
-#if defined(__AVX512F__)
+#if defined(__AVX__) && !defined(__clang__) /* GCC's own names: reading immintrin.h takes longer than a small kernel */
+#ifdef __AVX512F__
+#define BYTES 64
+#ifdef SINGLE
+#define WIDE(name, ...) ({ wide none = none; __builtin_ia32_##name##ps512_mask(__VA_ARGS__, none, -1, 4); })
+#else
+#define WIDE(name, ...) ({ wide none = none; __builtin_ia32_##name##pd512_mask(__VA_ARGS__, none, -1, 4); })
+#endif
+#else
+#define BYTES 32
+#ifdef SINGLE
+#define WIDE(name, ...) __builtin_ia32_##name##ps256(__VA_ARGS__)
+#else
+#define WIDE(name, ...) __builtin_ia32_##name##pd256(__VA_ARGS__)
+#endif
+#endif
+typedef real wide __attribute__((vector_size(BYTES)));
+#elif defined(__AVX512F__)
 #include <immintrin.h>
 #define BYTES 64
 #ifdef SINGLE
