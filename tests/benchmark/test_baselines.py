@@ -35,7 +35,7 @@ def transcription(task: Plans) -> Transcription:
     return Transcription(robot, task.boundary, at_knots)
 
 
-@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
 def test_the_derivatives_of_trajopt_are_those_of_its_functions(suite: str) -> None:
     found = transcription(one_of(suite))
     x = found.start() + 0.1 * np.random.default_rng(0).normal(size=len(found.start()))

@@ -45,7 +45,7 @@ def tops_of(check: StateCheck, task: Plans) -> np.ndarray:
     return check.tops(task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
 
 
-@pytest.mark.parametrize("suite", ["hits-81", "heavy-100"])
+@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
 def test_states_are_allowed_as_pinocchio_and_the_search_in_joint_space_have_it(suite: str) -> None:
     """Near a plan, where either happens, and anywhere."""
     task = one_of(suite)

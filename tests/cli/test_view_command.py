@@ -19,6 +19,8 @@ from cnpgen.cli.view.bodies import robot_bodies, tube, wrapped
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from tests.conftest import HANGING
+from tests.examples.plan_files import plans_of
+from tests.examples.plans import load
 from tests.examples.shaped_robot import WEDGE, write_problem
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -49,10 +51,10 @@ def array(text: str, dtype: str, *shape: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two plans of a carried object, from the shipped planner."""
+    """Two plans of a carried object, and a folder of rows beside them."""
     folder = tmp_path_factory.mktemp("view")
-    made = cnpgen.make_dataset("heavy-object", folder / "rows", n=40, workers=1)
-    assert main(["plan", str(made.folder), "--model", "heavy-object", "--n", "2", "-o", str(folder / "plans.h5")]) == 0
+    cnpgen.make_dataset("heavy-object", folder / "rows", n=40, workers=1)
+    cnpgen.save_plans(folder / "plans.h5", plans_of(load("dragging"), load("transport")))
     return folder / "plans.h5"
 
 

@@ -10,6 +10,7 @@ from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.record import record_problem
+from tests.conftest import some
 
 LARGEST = 3_000_000  # bytes
 STRICT = {"airhockey-hit": 0.95, "airhockey-onthefly": 0.85, "airhockey-replan": 0.85, "heavy-object": 0.95}
@@ -27,7 +28,7 @@ def test_a_model_is_small_and_of_the_problem_as_it_is_shipped(name):
     assert list(model.problem.differences(record_problem(problem))) == []
 
 
-@pytest.mark.parametrize("name", STRICT)
+@pytest.mark.parametrize("name", some(STRICT, 1, "slow"))
 def test_a_model_is_as_good_as_it_says(name, tiny):
     planner = Planner(name)
     asked = read_rows(tiny(name), planner.model)  # raises if rows are drawn in another way now
