@@ -566,7 +566,7 @@ print("casadi" in sys.modules)
 """
 
 
-@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+@pytest.mark.parametrize("backend", some([pytest.param("compiled", marks=needs_compiler), "numpy"], 1, "slow"))
 def test_a_warm_start_does_not_import_casadi(prepare: Prepare, backend):
     for name in ("airhockey-hit", "airhockey-replan", "heavy-object"):
         prepare(name, backend)

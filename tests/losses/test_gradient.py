@@ -53,7 +53,7 @@ def check_along_random_directions(
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(("label", "term", "form"), CASES)
+@pytest.mark.parametrize(("label", "term", "form"), some(CASES, 6, "slow"))
 def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_differences(label, term, form):
     backend = {"backend": "numpy"} if form == "paper" else {}  # for six plans that is quicker than compiling
     of, given, random = loss(PROBLEM_OF[label], form=form, **backend), far(label), np.random.default_rng(3)

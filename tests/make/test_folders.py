@@ -118,7 +118,7 @@ def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_correct
     assert validate_dataset(tmp_path / "out").ok
 
 
-@pytest.mark.parametrize("content", ["cut", "flipped"])
+@pytest.mark.parametrize("content", some(["cut", "flipped"], 1, "slow"))
 def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, content):
     folder = tmp_path / "out"
     make_tiny(folder, part=(0, 9))

@@ -11,7 +11,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import Round
 from cnpgen.pipelines.undecided import unmet
 from cnpgen.problems.constraints.constraint import Condition
-from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages
+from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 NO_NUMBERS = [
@@ -52,7 +52,7 @@ def rounds(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, Round]]:
     return {name: (prepare(name), roomy(prepare(name), run_stages(prepare(name), 250, seed=111))) for name in SHIPPED}
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", some(BACKENDS, 1, "slow"))
 @pytest.mark.parametrize("name", SHIPPED)
 def test_what_the_stages_made_passes(prepare: Prepare, rounds, name, backend):
     _, draws = rounds[name]
@@ -106,7 +106,7 @@ def test_one_wrong_number_is_rejected_under_its_constraint(rounds, name, column,
 
 
 @pytest.mark.parametrize(("backend", "value"), NO_NUMBERS)
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 def test_a_number_that_is_none_is_never_accepted_wherever_it_is(prepare: Prepare, rounds, name, backend, value):
     _, draws = rounds[name]
     columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in draws.columns]
@@ -150,7 +150,7 @@ def test_reasons_are_given_in_the_order_of_the_problem_s_constraints(rounds):
     assert fates(judged(prepared, draws, start_dq=dq)) == {"joint velocity limit"}
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 def test_float32_rows_are_judged_as_they_are_stored(prepare: Prepare, name):
     block = prepare(name, dtype="float32").block(5, "train", 0, stop=300)
     for field, values in block.columns.items():

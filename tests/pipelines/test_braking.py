@@ -87,7 +87,7 @@ def kernels(prepared: PreparedPipeline, backend: str, kernels_of):
     return table, library.load(tip_state), library.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", some(BACKENDS, 1, "slow"))
 def test_braking_ends_where_an_independent_roll_out_ends(fast, suspects, kernels_of, backend):
     prepared, _ = fast
     table, _, brake = kernels(prepared, backend, kernels_of)

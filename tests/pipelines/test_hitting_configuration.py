@@ -12,7 +12,7 @@ from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_newton import basic_joints, newton_step
 from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, ik_step
 from cnpgen.robots.robot import Robot
-from tests.conftest import Arm, Prepare, run_stages
+from tests.conftest import Arm, Prepare, run_stages, some
 
 Array = np.ndarray
 DRAWS = 40
@@ -53,7 +53,7 @@ class Search:
         return found.x if np.linalg.norm(self.miss(found.x)) < 1e-7 else None
 
 
-@pytest.fixture(scope="module", params=["airhockey-hit", "airhockey-replan"])
+@pytest.fixture(scope="module", params=some(["airhockey-hit", "airhockey-replan"], 1, "slow"))
 def solved(request: pytest.FixtureRequest, prepare: Prepare) -> list[tuple[Search, Array, Array]]:
     """Searches, their first guesses by inverse kinematics, and our solutions."""
     prepared = prepare(request.param)
@@ -100,6 +100,7 @@ def test_slsqp_finds_nothing_better_from_the_same_start(solved):
     assert same > 0.9 * DRAWS
 
 
+@pytest.mark.slow
 def test_slsqp_finds_nothing_better_from_other_starts(solved):
     """Here of 80 draws; 19,029 runs of SLSQP for 1251 replanning draws and 1362 hits found nothing better either."""
     reached = 0

@@ -86,6 +86,7 @@ def weak(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
     return prepared, run_stages(prepared, DRAWS, seed=61)
 
 
+@pytest.mark.slow
 def test_small_torque_limits_hold_exactly(weak):
     prepared, draws = weak
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)

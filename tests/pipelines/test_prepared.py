@@ -67,7 +67,9 @@ def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple
     return columns, merge_fates([part.fates for part in made])
 
 
-@pytest.mark.parametrize("cuts", [[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]])
+@pytest.mark.parametrize(
+    "cuts", some([[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]], 2, "slow")
+)
 def test_pieces_of_a_block_are_its_rows_and_their_fates_add_up(prepared, whole, cuts):
     columns, fates = pieces(prepared, cuts)
     assert_same_columns(columns, whole.columns)
@@ -106,6 +108,7 @@ def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[
     return np.cumsum(sizes).tolist(), tails
 
 
+@pytest.mark.slow
 def test_a_piece_that_begins_with_a_round_counts_the_draws_rejected_at_the_end_of_the_one_before(prepare: Prepare):
     prepared = prepare("heavy-object")
     tested = 0
@@ -181,7 +184,7 @@ def test_density_maps_count_every_draw_and_every_row(prepared, whole):
         np.testing.assert_allclose(density.accepted, expected, atol=2)  # a draw on the line between two cells
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 def test_nothing_that_the_stages_pass_on_is_rejected_at_the_last_gate(prepare: Prepare, name):
     """The stages are exact: the gate is there for what nobody has thought of."""
     prepared = prepare(name)

@@ -20,13 +20,13 @@ from cnpgen.refine.solver.residuals import stage_values
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
-from tests.conftest import Prepare, run_stages
+from tests.conftest import Prepare, run_stages, some
 from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_problem
 
 COLLISION = '[[stage]]\nuse = "collision"\nend = "start"\njudge = "segments"\n'
 
 
-@pytest.fixture(scope="module", params=[OBSTACLES, KINDS], ids=["boxes", "kinds"])
+@pytest.fixture(scope="module", params=some([OBSTACLES, KINDS], 1, "slow"), ids=["boxes", "kinds"])
 def problem(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Problem:
     return load_problem(write_problem(tmp_path_factory.mktemp("crane"), obstacles=request.param))
 

@@ -8,7 +8,7 @@ from cnpgen.planner.kit import make_kit
 from cnpgen.planner.landing import make_landing
 from cnpgen.planner.preparation import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import anchor_line, assemble
-from tests.conftest import columns_of, needs_compiler
+from tests.conftest import columns_of, needs_compiler, some
 from tests.examples.models import boundary_of_columns, landing_of, meaning_of, surroundings_of
 from tests.planner.test_parts import heights, worst_tilt
 
@@ -53,7 +53,7 @@ def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, na
     assert landing_of(name).land(path.astype(np.float32), tops).dtype == np.float32
 
 
-@pytest.mark.parametrize("name", DATASETS)
+@pytest.mark.parametrize("name", some(DATASETS, 1, "slow"))
 def test_gradients_behind_the_landing_are_taken_back_exactly(tiny, name):
     path, tops = nearby(tiny, name, 3)
     landing, random = landing_of(name), np.random.default_rng(1)

@@ -13,7 +13,7 @@ from cnpgen.errors import UsageError
 from cnpgen.planner.omega import Omega
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.trajectory.boundary import Boundary
-from tests.conftest import needs_compiler
+from tests.conftest import needs_compiler, some
 from tests.examples.plans_of_networks import at_ends, boundary, outputs
 
 PROBLEMS = ("airhockey", "heavy-object")
@@ -25,7 +25,7 @@ def omegas(cache_folder: Path, fastest: Any) -> dict[str, Omega]:
     return {name: Omega(name, backend=backends[name], cache_folder=cache_folder) for name in PROBLEMS}
 
 
-@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("problem", some(PROBLEMS, 1, "slow"))
 def test_boundary_conditions_hold_whatever_a_network_says(omegas: dict[str, Omega], problem: str) -> None:
     omega, given = omegas[problem], boundary(problem, 4)
     points = omega(omega.tasks(given), *outputs(omega, 4))
@@ -74,7 +74,7 @@ def test_transports_are_the_same_compiled_and_interpreted(omegas: dict[str, Omeg
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)  # rounding, after an inverse
 
 
-@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+@pytest.mark.parametrize("backend", some([pytest.param("compiled", marks=needs_compiler), "numpy"], 1, "slow"))
 def test_a_row_that_overflows_touches_no_other(backend: Any, cache_folder: Path) -> None:
     omega = Omega("airhockey", backend=backend, cache_folder=cache_folder)
     tasks, (phi, log_rate) = omega.tasks(boundary("airhockey", 4)), outputs(omega, 4)

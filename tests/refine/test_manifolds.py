@@ -14,12 +14,11 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.state import World
 from tests.examples.manifolds import MANIFOLDS, ROBOT, ends_on, problem_on
 
-TWICE = {"rectangle", "line"}  # beside a plane and a pose they only repeat the claim
+REPEATS = pytest.mark.extended  # beside a plane and a pose
+MARKS = {"plane": (), "rectangle": REPEATS, "line": REPEATS}  # of the others one is enough in the default run, too
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.extended) if name in TWICE else name for name in MANIFOLDS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, pytest.mark.slow)) for name in MANIFOLDS])
 def test_a_motion_on_a_manifold_is_found_from_nothing(name: str, tmp_path: Path) -> None:
     problem, q, world = problem_on(name), ends_on(name), World(ROBOT, (), None)
     rest, tips = np.zeros((1, ROBOT.n)), []

@@ -82,6 +82,7 @@ def test_a_refinement_is_printed_as_one_line(problems: Plans) -> None:
     assert "\n" not in text
 
 
+@pytest.mark.slow
 def test_neither_workers_nor_the_order_of_the_plans_change_anything(problems: Plans, solved: Plans) -> None:
     shuffled = np.random.default_rng(0).permutation(N)
     again = refine_plans(problems[shuffled], workers=2).plans

@@ -190,6 +190,7 @@ def test_a_tip_that_cannot_stop_before_the_edge_is_proven_to_leave_the_table() -
     assert "after the start the tip is" in finding.text
 
 
+@pytest.mark.slow
 def test_the_same_at_the_goal() -> None:
     plan = at_the_edge(clearance=0.01, speed=1.5)
     finding = explain_case(mirrored(plan))

@@ -43,7 +43,7 @@ def test_a_good_dataset_has_no_findings_and_every_shard_is_announced(dataset: Pa
     assert announced == [task.file for task in shards(BLUEPRINT)]
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", some(FILES, 3, "slow"))
 @pytest.mark.parametrize("where", some([0.77, 0.0, 0.3, 1.0], 2))
 def test_a_flipped_byte_in_any_file_is_found_and_named(dataset: Path, name: str, where: float) -> None:
     content = bytearray((dataset / name).read_bytes())

@@ -172,7 +172,8 @@ def test_nothing_to_draw_is_said(unfinished, tmp_path):
         plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
 
 
-@pytest.mark.parametrize(("draws", "cells"), some([(200, 2), (2_000, 8), (100_000, 24)], 1, "slow"))
+@pytest.mark.slow
+@pytest.mark.parametrize(("draws", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
 def test_cells_of_a_map_hold_enough_draws_to_say_something(draws, cells, hits, tmp_path, monkeypatch):
     random = np.random.default_rng(0)
     drawn = np.bincount(random.integers(0, 24 * 24, draws), minlength=24 * 24).reshape(24, 24)
@@ -209,6 +210,7 @@ def test_missing_matplotlib_is_a_hint_and_not_a_traceback(hits, tmp_path, monkey
         plot_dataset(inspect_dataset(hits), tmp_path / "hits.png")
 
 
+@pytest.mark.slow
 def test_a_picture_that_cannot_be_written_is_a_machine_error(hits, tmp_path):
     with pytest.raises(MachineError, match="cannot write"):
         plot_dataset(inspect_dataset(hits), tmp_path / "no" / "such" / "folder.png")

@@ -28,7 +28,7 @@ UNCLIPPED = replace(SMALL, sample_clip=np.inf, batch_clip=np.inf)
 def shown(tmp_path_factory) -> Path:
     """A small certified dataset of hits."""
     folder = tmp_path_factory.mktemp("certified") / "hits"
-    recipe = replace(certified(tiny_recipe("airhockey-hit")), splits={"train": 64, "validation": 12})
+    recipe = replace(certified(tiny_recipe("airhockey-hit")), splits={"train": 32, "validation": 6})
     make_dataset(recipe, folder, workers=1)
     return folder
 
@@ -81,7 +81,7 @@ def test_network_boundary_and_distance_together_have_the_gradient_of_finite_diff
 def test_demonstrations_are_the_plans_of_the_rows(shown):
     found, columns = open_training_data(shown).demonstrations(6), columns_of(shown)
     assert found is not None
-    assert found.path.shape == (64, 15, 6)
+    assert found.path.shape == (32, 15, 6)
     np.testing.assert_allclose(found.path[7].ravel(), columns["path_control_points"][7], rtol=1e-6)
     np.testing.assert_allclose(found.path[:, 0], columns["start_q"], atol=1e-6)
     np.testing.assert_allclose(found.rate, columns["rate_control_points"], rtol=1e-6)

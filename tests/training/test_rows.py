@@ -50,6 +50,7 @@ def test_check_rows_are_not_among_those_that_the_last_model_is_judged_on(tiny, c
     assert len(source.judged(5, after=checks)) == 5
 
 
+@pytest.mark.slow
 def test_the_published_metric_learns_with_the_published_form(tiny, monkeypatch):
     monkeypatch.setattr("cnpgen.training.prepare.make_landing", lambda *_, **__: None)  # dear, and no part of the form
     source = open_training_data(tiny("heavy-object"))

@@ -78,6 +78,7 @@ def test_a_trapezoidal_profile_is_followed_within_a_milliradian() -> None:
     assert largest_error(fit_motion(t, q, spec=more), t, q) < 1e-4
 
 
+@pytest.mark.slow
 def test_standing_still_at_both_ends_keeps_the_rate_positive_and_uses_little_of_the_path() -> None:
     t = np.linspace(0, 1.4, 1401)
     q = minimum_jerk((t - 0.5) / 0.4)

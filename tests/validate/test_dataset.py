@@ -150,7 +150,7 @@ def test_the_files_of_a_dataset_are_all_tested(tiny: Tiny):
     assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()) == sorted(FILES)
 
 
-@pytest.mark.parametrize("file", KINDS)
+@pytest.mark.parametrize("file", some(KINDS, 3, "slow"))
 def test_a_flipped_byte_is_found_in_every_file(damaged: Path, file):
     whole = (damaged / file).read_bytes()
     random = np.random.default_rng(len(file))
@@ -173,7 +173,7 @@ def test_a_missing_file_is_named(damaged: Path, file):
     assert "missing" in named(report)[file]
 
 
-@pytest.mark.parametrize("file", KINDS)
+@pytest.mark.parametrize("file", some(KINDS, 3, "slow"))
 @pytest.mark.parametrize("keep", some([0.3, 0.0, 0.999], 2))
 def test_a_cut_off_file_is_named(damaged: Path, file, keep):
     whole = (damaged / file).read_bytes()
@@ -363,6 +363,7 @@ def test_made_again_are_all_rows_of_shards_that_begin_within_a_block(tmp_path):
         assert not validate_dataset(folder, regenerate=40).ok, row
 
 
+@pytest.mark.slow
 def test_the_backend_of_the_blueprint_makes_the_blocks_again(tmp_path):
     make_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out", workers=1, backend="numpy")
     report = validate_dataset(tmp_path / "out", regenerate=2)
