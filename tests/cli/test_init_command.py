@@ -157,6 +157,7 @@ def test_without_masses_and_shapes_their_constraints_are_left_out(tmp_path):
     assert "'self-clearance' is left out" in text
 
 
+@pytest.mark.slow
 def test_an_arm_of_sliding_joints_has_boxes_within_its_reach(tmp_path):
     slide = '<limit lower="0" upper="1" velocity="1" effort="200"/>'
     urdf = write_arm(tmp_path / "gantry.urdf", [("prismatic", axis, slide) for axis in ("1 0 0", "0 1 0", "0 0 1")])
@@ -228,6 +229,7 @@ def test_joints_in_a_circle_are_refused(tmp_path, capsys):
     assert "its joints go round in a circle" in said
 
 
+@pytest.mark.slow
 def test_a_tip_that_reaches_no_box_is_refused(tmp_path, capsys):
     pan_tilt = [("revolute", "0 0 1", LIMIT), ("revolute", "0 1 0", LIMIT)]
     urdf = write_arm(tmp_path / "arm.urdf", pan_tilt)

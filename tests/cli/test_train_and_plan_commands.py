@@ -63,6 +63,7 @@ def test_train_writes_a_model_its_log_and_a_picture_and_prints_the_path(tiny, tm
     assert training["dataset"]["rows"] == {"train": 600, "validation": 60}
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_before_its_picture_was_drawn_draws_it_when_it_is_started_again(
     tiny, tmp_path, capsys, monkeypatch
 ):
@@ -121,6 +122,7 @@ def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
     assert trained.read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path):
     path = tmp_path / "m.h5"
@@ -145,9 +147,8 @@ def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path
     assert said in load_model(path).training["command"]
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "what"), some([("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")], 1, "slow")
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code", "what"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
 def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_path, number, code, what):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL[2:], "--steps", "1e5", "--quiet"]
     command = [sys.executable, "-m", "cnpgen", *words]

@@ -64,7 +64,7 @@ def test_jerks_are_drawn_where_they_are_limited(tmp_path: Path, drawn: list[Figu
 @pytest.mark.parametrize(
     ("label", "suffix"),
     [
-        *(("hit", "png"), ("transport", "pdf"), ("hit", "svg")),
+        *some([("hit", "png"), ("transport", "pdf"), ("hit", "svg")], 1, "slow"),
         *(pytest.param(*each, marks=again) for each in (("transport", "png"), ("hit", "pdf"), ("transport", "svg"))),
     ],
 )
@@ -179,7 +179,7 @@ def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_
 @pytest.mark.parametrize(
     ("label", "by"),
     [
-        *(("hit", 1.0), ("transport", 1e3), ("hit", 1e150)),
+        *some([("hit", 1.0), ("transport", 1e3), ("hit", 1e150)], 1, "slow"),
         *(pytest.param(*each, marks=again) for each in (("transport", 1.0), ("hit", 1e3), ("transport", 1e150))),
     ],
 )

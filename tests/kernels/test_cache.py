@@ -275,6 +275,7 @@ assert len(list((folder / "lib").iterdir())) == 1
 """
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_cache_that_can_only_be_read_is_read_and_what_it_lacks_is_compiled_for_the_run(tmp_path):
     warm = tmp_path / "warm"

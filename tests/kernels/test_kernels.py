@@ -520,6 +520,7 @@ print("rebuilt")
 """
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_damaged_library_is_compiled_again_and_does_not_crash_the_interpreter(root, tmp_path):
     (tmp_path / "tape").write_bytes(tape_from_function(root, ROOT).to_bytes())

@@ -19,7 +19,6 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.symbolic.boxes import signed_segment_box_distance
 from cnpgen.symbolic.linalg import symbols
 from cnpgen.symbolic.state import HeldState, SymbolicState
-from tests.conftest import some
 from tests.examples.losses import huber
 from tests.examples.plans import PROBLEMS, ROBOTS
 from tests.symbolic.test_state import HIGH, LOW, box_bounds, coal_segment_separation, segments
@@ -62,7 +61,8 @@ def depth_of(points: Array) -> Array:
     return np.minimum(points - LOW, HIGH - points).min(axis=-1)
 
 
-@pytest.mark.parametrize("kind", some(["inside", "random"], 1, "slow"))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["inside", "random"])
 def test_inside_the_signed_distance_is_minus_the_depth_of_the_middle_of_the_part_inside(signed, kind):
     seen = 0
     for ends in ends_of(kind):

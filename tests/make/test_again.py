@@ -182,6 +182,7 @@ def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_
     assert 1 <= len(compared) < len(tasks)
 
 
+@pytest.mark.slow
 def test_shard_size_and_backend_of_an_unfinished_dataset_are_kept(tmp_path):
     recipe = tiny_recipe("airhockey-hit")
     make_dataset(recipe, tmp_path, shard_size=77, backend="numpy", workers=1, part=(0, 2))

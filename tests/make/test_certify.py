@@ -82,6 +82,7 @@ def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) 
     assert [file_sha256(folder / name) for name in shards] == [file_sha256(again / name) for name in shards]
 
 
+@pytest.mark.slow
 def test_samples_without_a_plan_are_counted_under_their_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     solve, count = engine.refine_task, itertools.count()
 

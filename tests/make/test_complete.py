@@ -55,6 +55,7 @@ def test_columns_of_a_wrong_shape_are_refused(columns, message):
         complete("airhockey-hit", **columns)
 
 
+@pytest.mark.slow
 def test_without_a_table_positions_need_all_three_coordinates():
     with pytest.raises(UsageError, match=r"goal_xyz must have shape \(3,\) or \(N, 3\), got \(2,\)"):
         complete("heavy-object", start_xyz=[0.4, -0.4, 0.3], goal_xyz=[0.4, 0.4])

@@ -245,6 +245,7 @@ def rounds(monkeypatch) -> Counter:
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", some([500, 512, 4095]))
 def test_a_block_is_drawn_once_however_small_the_shards(tmp_path, rounds, size):
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 2 * BLOCK_ROWS, "validation": 600})

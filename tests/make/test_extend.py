@@ -147,6 +147,7 @@ def test_a_run_that_ends_before_the_new_blueprint_is_written_has_lost_nothing(da
     assert digests(damaged) == digests(grown)
 
 
+@pytest.mark.slow
 def test_splits_that_were_too_small_to_be_there_appear(tmp_path):
     folder = make_tiny(tmp_path / "out", n=5).folder
     assert load_blueprint(folder).splits == {"train": 5}

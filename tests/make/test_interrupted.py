@@ -177,6 +177,7 @@ def test_a_disk_that_is_really_full_loses_nothing(tiny, small_disk):
     assert digests(folder) == digests(tiny("airhockey-hit"))
 
 
+@pytest.mark.slow
 def test_another_dataset_in_the_same_folder_meanwhile_stops_the_first(tmp_path):
     folder = tmp_path / "out"
 

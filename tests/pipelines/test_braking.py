@@ -189,7 +189,8 @@ def braking_variant(folder: Path, name: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", some(["airhockey-hit", "airhockey-replan"], 1, "slow"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
 def test_a_recipe_with_braking_reach_makes_blocks_and_rejects_less_than_the_ballistic_rule(
     prepare: Prepare, tmp_path, name
 ):

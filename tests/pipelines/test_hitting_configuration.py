@@ -206,6 +206,7 @@ def cramped(prepare: Prepare) -> list[tuple[Search, Array]]:
     ]
 
 
+@pytest.mark.slow
 def test_optima_on_limits_are_those_of_slsqp(cramped):
     assert len(cramped) > 40
     same = 0

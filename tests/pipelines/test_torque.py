@@ -42,6 +42,7 @@ def test_torque_ratios_of_accepted_rows_are_stored_and_at_most_one(prepare: Prep
         assert 0.3 < max(expected) <= 1
 
 
+@pytest.mark.slow
 def test_configurations_that_need_too_much_torque_are_rejected_and_counted(prepare: Prepare):
     pipeline = prepare("heavy-object").pipeline
     problem = replace(pipeline.problem, limits=replace(pipeline.problem.limits, torque_scale=0.35))

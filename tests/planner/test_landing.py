@@ -35,6 +35,7 @@ def test_a_plan_near_the_table_is_on_it_behind_the_landing(tiny):
     assert (after < 0.3 * before).all()
 
 
+@pytest.mark.slow
 def test_an_object_that_is_nearly_upright_is_so_behind_the_landing(tiny):
     path, tops = nearby(tiny, "heavy-object", 4)
     landed = landing_of("heavy-object").land(path, tops)

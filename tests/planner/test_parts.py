@@ -71,6 +71,7 @@ def heights(paths: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_a_second_step_bends_the_line_further_onto_the_table(tiny):
     straight, once, twice = (heights(bent_paths(tiny, "airhockey-replan", "airhockey", k)) for k in (0, 1, 2))
     assert np.median(straight) > 5e-3
@@ -181,6 +182,7 @@ def test_motions_within_their_limits_are_left_as_they_are(fast):
     np.testing.assert_array_equal(make_slowing(given.problem, given.robot, given.kernels).factor(slow, tops), 1.0)
 
 
+@pytest.mark.slow
 def test_a_torque_that_gravity_alone_exceeds_slows_nothing_down(fast):
     from dataclasses import replace
 

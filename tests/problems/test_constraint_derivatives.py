@@ -10,7 +10,6 @@ import pytest
 
 from cnpgen.problems.load import load_problem
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from tests.conftest import some
 from tests.problems.test_constraints import HEAVY, KINDS, Bench, gantry_problem, measured_forms, values
 
 STEP = 1e-6
@@ -167,7 +166,8 @@ def test_every_term_says_its_name_unit_bounds_and_what_is_called_valid(problem: 
     assert len(set(names)) == len(names) >= 6
 
 
-@pytest.mark.parametrize("problem", some(["airhockey", "heavy-object"], 1, "slow"))
+@pytest.mark.slow
+@pytest.mark.parametrize("problem", ["airhockey", "heavy-object"])
 def test_the_stages_of_a_motion_have_the_derivatives_of_their_values(problem: str) -> None:
     here, random = bench(problem), np.random.default_rng(11)
     value, both = stage_values(here.robot, here.problem), stage_jacobian(here.robot, here.problem)

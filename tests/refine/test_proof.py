@@ -67,6 +67,7 @@ def test_nothing_is_proven_about_a_problem_with_a_valid_plan(label: str) -> None
     assert explain(load(label)).kind is Feasibility.UNKNOWN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count"), some([("airhockey-replan", 3), ("airhockey-hit", 3), ("heavy-object", 1)], 1, "slow")
 )

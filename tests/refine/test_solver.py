@@ -91,7 +91,7 @@ def test_residuals_are_the_constraints_of_the_problem_in_their_natural_sizes() -
     np.testing.assert_allclose(g[:, 12:18], states.ddq[0] / plan.robot.acceleration_limit, atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["effort", "jerk", "centrifugal"])
+@pytest.mark.parametrize("kind", some(["effort", "jerk", "centrifugal"], 1, "slow"))
 def test_the_objective_is_an_integral_over_time_as_pinocchio_evaluates_it(kind: str) -> None:
     plan = load("hit")
     with_it, without = (transcription(plan, 24, criterion=each) for each in (Criterion(kind, 1.0), None))
@@ -358,6 +358,7 @@ def test_a_refused_step_is_never_tried_again_as_it_was(label: str, monkeypatch: 
     assert all(after[0] < before[0] or after[1] > before[1] for before, after in refused)
 
 
+@pytest.mark.slow
 def test_what_a_transcription_remembers_is_of_the_variables_that_it_is_asked_about() -> None:
     plan = load("hit")
     criterion = Criterion("centrifugal", 0.01)

@@ -225,6 +225,7 @@ def test_the_search_finds_less_overhang_than_the_best_start(monkeypatch):
     assert found < 0.95 * covering_capsule([long_box]).overhang
 
 
+@pytest.mark.slow
 def test_capsules_and_pairs_are_kept_and_what_was_damaged_is_found_again(tmp_path, monkeypatch, shape):
     monkeypatch.setattr(pairs, "SAMPLES", 300)
     file = write_crane(tmp_path)

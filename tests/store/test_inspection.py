@@ -145,6 +145,7 @@ def test_what_is_no_dataset_is_refused(tmp_path):
         inspect_dataset(tmp_path / "file")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", some(["png", "svg"]))
 def test_a_dataset_is_drawn(hits, tmp_path, suffix):
     plot_dataset(inspect_dataset(hits), tmp_path / f"hits.{suffix}")

@@ -78,6 +78,7 @@ def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
     assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
 
 
+@pytest.mark.slow
 def test_finishing_in_several_processes_at_once_gives_a_good_dataset(dataset: Path) -> None:
     with multiprocessing.get_context("spawn").Pool(3) as pool:
         manifests = pool.starmap(finalize, [(dataset, BLUEPRINT)] * 9)

@@ -86,6 +86,7 @@ def test_a_run_that_was_cut_and_resumed_gives_the_bits_and_the_log_of_an_uncut_o
     assert cut.score == whole.score
 
 
+@pytest.mark.slow
 def test_seeds_give_the_same_model_again_and_another_seed_another(train, uncut):
     again, other = train("again.h5"), train("other.h5", settings=replace(SMALL, seed=1))
     np.testing.assert_array_equal(again.model.parameters, uncut.model.parameters)
@@ -118,6 +119,7 @@ def test_the_log_says_loss_terms_budgets_weights_and_rate_of_every_hundredth_and
     assert not uncut.path.with_suffix(".checkpoint").exists()
 
 
+@pytest.mark.slow
 def test_seconds_become_steps_before_the_run_begins(train):
     begun = []
     trained = train(steps=None, cpu_seconds=0.2, begin=lambda state, run: begun.append(state.steps))
@@ -141,6 +143,7 @@ def test_epochs_become_steps_too(train):
     assert train(steps=None, epochs=2).model.training["steps"] == 2 * (600 // 32)
 
 
+@pytest.mark.slow
 def test_a_finished_model_is_returned_as_it_is_and_another_one_is_replaced_only_by_force(train, tmp_path):
     first = train()
     before = (tmp_path / "model.h5").read_bytes()
@@ -218,6 +221,7 @@ def test_force_goes_on_with_its_own_checkpoint_and_throws_away_another_one(train
     assert begun[1] == 0
 
 
+@pytest.mark.slow
 def test_the_checkpoint_of_another_run_is_not_taken_for_this_one(train):
     with pytest.raises(CutOffError):
         train(watch=cut_at(5))
@@ -237,6 +241,7 @@ def test_a_damaged_checkpoint_is_an_error_and_no_other_model(train, tmp_path):
         train()
 
 
+@pytest.mark.slow
 def test_deaths_between_the_last_step_and_the_model_leave_one_last_line(train, uncut, tmp_path, monkeypatch):
     """The log's last line comes after the last checkpoint: what dies while the model is written writes it again."""
     for _ in range(2):

@@ -61,6 +61,7 @@ def test_single_parameters_agree_as_well(tiny):
         assert gradient[i] == pytest.approx((high - low) / 2e-5, rel=1e-4, abs=1e-6 * np.linalg.norm(gradient))
 
 
+@pytest.mark.slow
 def test_a_plan_without_a_loss_takes_no_part_in_the_gradient_of_the_others(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
     broken = replace(rows, tops=np.where(np.arange(6)[:, None] == 2, np.nan, rows.tops))

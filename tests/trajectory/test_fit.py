@@ -121,6 +121,7 @@ def test_uneven_and_missing_samples_do_not_matter() -> None:
         assert largest_error(motion, dense, np.column_stack([np.sin(4 * dense), np.cos(3 * dense)])) < 2e-3
 
 
+@pytest.mark.slow
 def test_few_samples_with_velocities_mean_cubics_between_them() -> None:
     from scipy.interpolate import CubicHermiteSpline
 

@@ -78,6 +78,7 @@ def test_phases_that_are_nan_give_nan_and_disturb_no_others() -> None:
     assert np.isnan(found).tolist() == [False, True, False]
 
 
+@pytest.mark.slow
 def test_the_lowest_value_is_found_between_any_samples() -> None:
     random = np.random.default_rng(3)
     s = np.linspace(0, 1, 20_001)

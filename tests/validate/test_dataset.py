@@ -65,7 +65,7 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
 
 
 @pytest.mark.parametrize("dtype", some(["float64", "float32"], 1, "slow"))
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 def test_what_was_made_is_valid_to_the_last_row_and_made_again_to_the_bit(tiny: Tiny, tmp_path, name, dtype):
     folder = tiny(name)
     if dtype == "float32":
@@ -183,7 +183,7 @@ def test_a_cut_off_file_is_named(damaged: Path, file, keep):
     assert file in named(report)
 
 
-@pytest.mark.parametrize("file", some(KINDS, 2, "slow"))
+@pytest.mark.parametrize("file", some(KINDS, 1, "slow"))
 def test_damaged_files_are_findings_and_not_exceptions_however_much_is_asked_for(damaged: Path, file):
     """Also where the damage keeps the size, so that a shard seems to be there."""
     whole = bytearray((damaged / file).read_bytes())
@@ -272,7 +272,7 @@ WRONG = [
 
 @pytest.mark.parametrize(
     ("name", "change", "check"),
-    some(WRONG, 5, "slow"),
+    some(WRONG, 3, "slow"),
     ids=[f"{index} {check}" for index, (_, _, check) in enumerate(WRONG)],
 )
 def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(tiny: Tiny, tmp_path, name, change, check):
@@ -370,6 +370,7 @@ def test_the_backend_of_the_blueprint_makes_the_blocks_again(tmp_path):
     assert (report.ok, report.identical) == (True, 2)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(tiny: Tiny, monkeypatch, fresh_compiler):
     folder = tiny("airhockey-hit")

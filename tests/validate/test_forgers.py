@@ -155,7 +155,7 @@ def test_the_honest_dataset_is_sound(honest: Path) -> None:
     assert validate_dataset(honest, deep=True, regenerate=1, workers=1).ok
 
 
-@pytest.mark.parametrize("forgery", some(FORGERIES, 5, "slow"), ids=lambda forgery: forgery.forge.__name__)
+@pytest.mark.parametrize("forgery", some(FORGERIES, 2, "slow"), ids=lambda forgery: forgery.forge.__name__)
 def test_who_notices_a_forgery(honest: Path, tmp_path: Path, forgery: Forgery) -> None:
     folder = forged(honest, tmp_path / "set", forgery.forge)
     assert validate_dataset(folder).ok
