@@ -81,6 +81,7 @@ def test_jumps_in_the_velocity_of_a_linear_trajectory_are_seen_as_accelerations(
     assert abs(margin.value) > 5 * abs(margin.bound)
 
 
+@pytest.mark.slow
 def test_a_plan_and_its_samples_are_executed_alike() -> None:
     pytest.importorskip("mujoco")
     plan = stored("hit")

@@ -107,6 +107,7 @@ def hopeless(monkeypatch) -> None:
     monkeypatch.setattr(PreparedPipeline, "_round", rejected)
 
 
+@pytest.mark.slow
 def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_corrected_one(tmp_path, monkeypatch):
     hopeless(monkeypatch)
     with pytest.raises(RecipeError, match=r"0 of .* draws were accepted"):

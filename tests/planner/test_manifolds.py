@@ -30,6 +30,7 @@ def off(problem: Problem, path: np.ndarray) -> np.ndarray:
 DEAR = pytest.mark.extended  # building kernels of two and more equalities takes long, and the claim is the same
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", *(pytest.param(name, marks=DEAR) for name in ("line", "axis", "pose"))])
 def test_paths_near_a_manifold_are_on_it_behind_the_landing(name: str, tmp_path: Path) -> None:
     problem, (start, goal) = problem_on(name), ends_on(name)

@@ -65,7 +65,8 @@ def test_what_capsules_clear_is_clear(bench, name, form):
     assert clear > 50 or (name == "itself" and form != "symbolic_at")
 
 
-@pytest.mark.parametrize("form", some(["symbolic", "penalised"], 1, "slow"))
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["symbolic", "penalised"])
 def test_what_capsules_clear_of_obstacles_of_every_kind_is_clear(tmp_path, form):
     bench = Bench(load_problem(write_problem(tmp_path, obstacles=KINDS)))
     constraint, tops = CLEARANCES["obstacles"], place_obstacles(bench.problem.obstacle)

@@ -103,7 +103,7 @@ def off_the_height(plan: Plan, by: float) -> Plan:
             (off_the_height(at_the_edge(0.016, 1.0), 3e-3), True),
             (off_the_height(at_the_edge(0.016, 1.0), -4e-3), True),
         ],
-        2,
+        1,
         "slow",
     ),
     ids=["goal on the verge", "goal", "start", "above", "below"],

@@ -61,6 +61,7 @@ def test_a_machine_whose_clock_is_hours_ahead_leaves_what_another_one_is_writing
     assert not list((tmp_path / "_work").iterdir())
 
 
+@pytest.mark.slow
 def test_a_second_machine_on_the_folder_of_a_dataset_does_not_disturb_the_first(tiny, tmp_path, monkeypatch) -> None:
     """Each time the first one has written a shard, the other one begins its own part of the same dataset."""
     written, replace = [], Path.replace

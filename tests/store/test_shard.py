@@ -162,6 +162,7 @@ def test_an_unreadable_shard_is_a_machine_error(tmp_path: Path, monkeypatch: pyt
         read_shard(tmp_path / "a.h5")
 
 
+@pytest.mark.slow
 def test_processes_read_the_same_shard_at_once(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write(path)
