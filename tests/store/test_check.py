@@ -21,13 +21,13 @@ __all__ = ["dataset"]
 
 TASK = shards(BLUEPRINT)[0]
 FILES = [
+    "train/shard-00000.h5",
     "plan.json",
+    "train/shard-00001.json",
     "manifest.json",
     "stats.json",
     "README.md",
     "croissant.json",
-    "train/shard-00000.h5",
-    "train/shard-00001.json",
     "validation/shard-00000.h5",
 ]
 

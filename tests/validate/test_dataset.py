@@ -27,8 +27,8 @@ from tests.conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, some, tiny_
 
 Tiny = Callable[[str], Path]
 FILES = [
-    "README.md", "croissant.json", "manifest.json", "plan.json", "stats.json",
-    "train/shard-00001.h5", "train/shard-00001.json", "train/shard-00000.h5", "train/shard-00000.json",
+    "train/shard-00001.h5", "manifest.json", "train/shard-00001.json", "README.md", "croissant.json", "plan.json",
+    "stats.json", "train/shard-00000.h5", "train/shard-00000.json",
     "train/shard-00002.h5", "train/shard-00002.json", "validation/shard-00000.h5", "validation/shard-00000.json",
 ]  # fmt: skip
 KINDS = some(FILES, 7)  # the others are shards, too
