@@ -94,7 +94,7 @@ def test_the_gradient_of_a_motion_that_starts_off_the_table_is_that_of_central_d
     check_along_random_directions(given, of, value, random, **options)
 
 
-@pytest.mark.parametrize("label", ["hit", "transport"])
+@pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
 def test_single_components_of_the_gradient_of_all_terms_together_are_those_of_central_differences(label):
     of, given = loss(PROBLEM_OF[label]), far(label)[2:4]
     value = given.evaluated(of)
@@ -125,7 +125,7 @@ def test_a_robot_inside_an_obstacle_has_a_gradient_in_the_signed_form_and_none_i
         assert (change > 0.1).all() if form == "signed" else (change == 0).all()
 
 
-@pytest.mark.parametrize("label", ["hit", "transport"])
+@pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
 def test_float32_gradients_are_those_of_float64_to_a_thousandth(label):
     given = far(label)
     exact, rough = given.evaluated(loss(PROBLEM_OF[label])), given.evaluated(loss(PROBLEM_OF[label], dtype="float32"))

@@ -44,7 +44,7 @@ def test_an_object_that_is_nearly_upright_is_so_behind_the_landing(tiny):
     assert np.max(after) < 0.2 * np.median(before)
 
 
-@pytest.mark.parametrize("name", DATASETS)
+@pytest.mark.parametrize("name", some(DATASETS, 1, "slow"))
 def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, name):
     path, tops = nearby(tiny, name)
     given = path.copy()
@@ -88,7 +88,7 @@ def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):
     assert np.isnan(found[2]).any()
 
 
-@pytest.mark.parametrize("name", DATASETS)
+@pytest.mark.parametrize("name", some(DATASETS, 1, "slow"))
 def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name):
     given = surroundings_of(name)
     boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), 8)

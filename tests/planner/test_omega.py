@@ -38,7 +38,7 @@ def test_boundary_conditions_hold_whatever_a_network_says(omegas: dict[str, Omeg
         np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
 
 
-@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("problem", some(PROBLEMS, 1, "slow"))
 @pytest.mark.parametrize("landing", [0, 1])
 def test_gradients_of_outputs_are_those_of_central_differences(problem: str, landing: int, omegas: Any) -> None:
     omega = omegas[problem] if landing else Omega(problem, bending_steps=0, landing_steps=0)
