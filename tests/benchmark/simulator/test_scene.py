@@ -1,6 +1,8 @@
 """The simulated arm is the URDF's: its dynamics are Pinocchio's, and it keeps its energy where nothing brakes it."""
 
 from dataclasses import replace
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
@@ -45,6 +47,23 @@ def with_tool() -> Scene:
 
 def test_a_tool_and_a_payload_of_the_problem_are_simulated() -> None:
     compare_with_pinocchio(with_tool())
+
+
+def test_names_of_strangers_are_no_part_of_the_scene(tmp_path: Path) -> None:
+    """Joints and obstacles may be called anything; what MuJoCo reads names no other file."""
+    name = f'x"/><include file="{tmp_path / "private.xml"}"/><geom name="'
+    shipped, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
+    problem = replace(
+        shipped,
+        robot=replace(shipped.robot, joints=(name, *shipped.robot.joints[1:])),
+        obstacle=tuple(replace(each, name=f"{name}{number}") for number, each in enumerate(shipped.obstacle)),
+    )
+    text = robot.urdf_text.replace('"joint_1"', quoteattr(name))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(text, encoding="utf-8")
+    problem = replace(problem, robot=replace(problem.robot, urdf=str(urdf)))
+    strange = Scene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
+    assert scene_xml(strange) == scene_xml(scene("heavy-object"))
 
 
 def test_motors_saturate_at_the_torques_of_the_problem() -> None:
