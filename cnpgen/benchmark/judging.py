@@ -1,8 +1,8 @@
 """What planners return, judged: plans as ``cnpgen evaluate`` does it, sampled trajectories by the same constraints.
 
 A sampled trajectory is looked at every millisecond, as the controller that executes it does. No spline is fitted to it:
-a fit would smooth away what it exceeds. Where it is linear between its samples, its acceleration is what the jumps of
-its velocity are, seen over a millisecond.
+a fit would smooth away what it exceeds. What jumps between two pieces counts as it is seen over a millisecond: the
+acceleration is the velocity's change where pieces are linear, the jerk is the acceleration's where they are cubic, too.
 """
 
 from functools import lru_cache
@@ -43,30 +43,35 @@ def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
         return Verdict(Reason.TOO_LONG)
     t = np.linspace(0, answer.duration, int(np.ceil(answer.duration / STEP)) + 1)
     with np.errstate(all="ignore"):
-        return _judge(problem, Samples(t / answer.duration, t), _course(answer, t))
+        return _judge(problem, Samples(t / answer.duration, t), answer)
 
 
-def _judge(problem: Plans, samples: Samples, states: Course) -> Verdict:
+def _judge(problem: Plans, samples: Samples, answer: Trajectory) -> Verdict:
     meaning, robot = open_problem(problem.problem)
+    states = _course(answer, samples.t, jerk=meaning.uses_jerk)
     goal_xyz = problem.columns["goal_xyz"][0]
     tops = obstacle_tops(meaning, problem.columns["start_xyz"][0], goal_xyz)
     world = _world(problem.problem)
-    world.set_path(states.q, states.dq, states.ddq, tops)
+    world.set_path(states.q, states.dq, states.ddq, tops, states.jerk)
     start_tip = world.tip_position[:, 0]
     margins = boundary_margins(states, problem.boundary, samples, robot.joint_names)
     for constraint in meaning.constraint:
         margins += [each.margin(meaning, samples) for each in measure(constraint, world, samples.s, start_tip)]
-    metrics = metrics_of(meaning, world, samples, np.full_like(states.q, np.nan))
+    unknown = np.full_like(states.q, np.nan)
+    metrics = metrics_of(meaning, world, samples, unknown if states.jerk is None else states.jerk)
     paper = paper_rule(meaning, world, tops, goal_xyz)
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.t))
 
 
-def _course(answer: Trajectory, t: Array) -> Course:
+def _course(answer: Trajectory, t: Array, *, jerk: bool) -> Course:
     """Evaluate a trajectory at times, joint by joint."""
     q, dq, ddq = answer.states(t)
     if answer.dq is None:
         ddq = np.gradient(dq, t, axis=0)
-    return Course(*(np.ascontiguousarray(values.T) for values in (q, dq, ddq)))
+    found = [q, dq, ddq]
+    if jerk:
+        found.append(np.gradient(ddq, t, axis=0) if answer.ddq is None else answer.jerks(t))
+    return Course(*(np.ascontiguousarray(values.T) for values in found))
 
 
 @lru_cache(maxsize=2)

@@ -20,21 +20,21 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.store.files.atomic import machine_error, write_file
 from cnpgen.store.files.documents import parse_json
-from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Form, Maybe, check_form
+from cnpgen.store.files.forms import ANYTHING, EVERY, FINITE, TEXT, WHOLE, Form, Maybe, check_form
 from cnpgen.store.paths import require_file
 
 FORMAT = "cnpgen-benchmark"
 FORMAT_VERSION = 1
-_POINTS = [Maybe(NUMBER)]
+_POINTS = [Maybe(FINITE)]
 _PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
 _NEEDED = {"t": _POINTS, "q": [_POINTS]}
 _SAMPLES = {**_NEEDED, "dq": [_POINTS], "ddq": [_POINTS]}
-_PLANNED = {"ending": TEXT, "planning_s": NUMBER, "planning_cpu_s": NUMBER, "error": TEXT}
+_PLANNED = {"ending": TEXT, "planning_s": FINITE, "planning_cpu_s": FINITE, "error": TEXT}
 _VERDICT = {
     "valid": ANYTHING,
     "paper": {"valid": ANYTHING, "finished": ANYTHING},
-    "metrics": {EVERY: Maybe(NUMBER)},
-    "value_over_bound": {EVERY: NUMBER},
+    "metrics": {EVERY: Maybe(FINITE)},
+    "value_over_bound": {EVERY: FINITE},
 }
 
 
@@ -135,7 +135,7 @@ def _check_row(row: Any) -> None:
     if "executed" in row:
         check_form(row, {"executed": {EVERY: {EVERY: ANYTHING}}})
         for executed in row["executed"].values():
-            check_form(executed, _present(dict.fromkeys(FIGURES, Maybe(NUMBER)), executed))
+            check_form(executed, _present(dict.fromkeys(FIGURES, Maybe(FINITE)), executed))
 
 
 def _present(forms: dict[str, Form], table: dict[str, Any]) -> dict[str, Form]:

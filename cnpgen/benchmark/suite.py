@@ -8,6 +8,7 @@ from cnpgen.benchmark.pucks import Pucks, hits_of
 from cnpgen.benchmark.turns import Lead, Turns, turns_of
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.load import load_dataset_recipe
+from cnpgen.pipelines.stages.given_positions import MOST_TASKS
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load import read_problem
 from cnpgen.problems.problem import Problem
@@ -24,7 +25,7 @@ class Draws:
     """Fresh draws of a dataset's recipe: none of its rows is among them."""
 
     recipe: str = field("name or path of a dataset or a pipeline")
-    n: int = field("how many problems", default=RANDOM, low=1)
+    n: int = field("how many problems", default=RANDOM, low=1, high=MOST_TASKS)
     seed: int = field("root seed of the draws", default=987_654_321, low=0)
 
 

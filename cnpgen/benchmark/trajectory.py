@@ -63,6 +63,10 @@ class Trajectory:
         q, dq, ddq = (np.asarray(self._piecewise(t, order)) for order in range(3))
         return q, dq, ddq
 
+    def jerks(self, t: Array) -> Array:
+        """Evaluate the jerks within its pieces [rad/s^3] at times [s] of shape (K,), shape (K, n)."""
+        return np.asarray(self._piecewise(np.clip(t, 0, self.duration), 3))
+
     @cached_property
     def _piecewise(self) -> Any:
         """The piecewise polynomial, a function of (t, order of the derivative)."""

@@ -20,6 +20,8 @@ from cnpgen.trajectory.motion import Motion
 
 Array = NDArray[np.float64]
 
+MOST_TURNS = 10_000  # a first motion is planned for each puck
+
 
 @dataclass(frozen=True, kw_only=True)
 class Turns:
@@ -32,6 +34,8 @@ class Turns:
         """Yield (key, what is wrong with it)."""
         if self.pucks.columns * self.pucks.rows % 2:
             yield "pucks", "the grid has a puck in its middle, which has no opposite: expected an even number of pucks"
+        if (count := self.pucks.columns * self.pucks.rows * len(self.when)) > MOST_TURNS:
+            yield "when", f"{count:,} turns are too many, expected at most {MOST_TURNS:,}"
 
 
 @dataclass(frozen=True, eq=False)

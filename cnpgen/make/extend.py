@@ -12,12 +12,13 @@ from cnpgen.make.load import makes_its_rows, restored
 from cnpgen.make.recipe import DatasetRecipe, split_rows
 from cnpgen.make.shards import Job, prepare
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.store.blueprint import Blueprint, write_blueprint
 from cnpgen.store.card import card_notes
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.leftovers import sweep
 from cnpgen.store.intact import AGAIN
-from cnpgen.store.layout import CARD, MANIFEST, WORK
+from cnpgen.store.layout import CARD, MANIFEST, PLAN, WORK
 from cnpgen.store.paths import require_folder
 from cnpgen.store.record import pending
 from cnpgen.store.workspace import check_place, find_workspace
@@ -98,8 +99,8 @@ def _extended(folder: Path, begun: Blueprint, recipe: DatasetRecipe, n: int) -> 
 def _notes(folder: Path) -> str:
     """Read the notes in the card; they are nowhere else in a dataset."""
     try:
-        return card_notes((folder / CARD).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError):
+        return card_notes(utf8_text(read_own(folder / CARD, folder / PLAN, "a card")))
+    except (OSError, ValueError):
         return ""
 
 

@@ -20,7 +20,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import Place
 from cnpgen.schema.parsing import Reader, parse
-from cnpgen.schema.texts import utf8_text
+from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.blueprint import REVISION, Blueprint
 
@@ -136,13 +136,14 @@ def load_notes(recipe: DatasetRecipe) -> str:
     """Read the text beside a recipe's file, of the same name with the ending ``.md``; empty where there is none.
 
     Raises:
-        RecipeError: It cannot be read, or is not UTF-8.
+        RecipeError: It cannot be read, is a link to another folder, too large or not UTF-8.
     """
     if not recipe.path.name:  # built in Python, from no file
         return ""
     card = recipe.path.with_suffix(".md")
     try:
-        return utf8_text(card.read_bytes(), advice="; it becomes part of the dataset's card") if card.is_file() else ""
+        advice = "; it becomes part of the dataset's card"
+        return utf8_text(read_own(card, recipe.path, "notes"), advice=advice) if card.is_file() else ""
     except OSError as error:
         raise RecipeError([f"{card}: cannot be read: {error.strerror or error}"]) from error
     except ValueError as error:

@@ -11,7 +11,8 @@ from cnpgen.errors import DatasetError, MachineError, UsageError, nearest
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
 from cnpgen.store.files.hdf5 import opened_hdf5
-from cnpgen.store.files.kind import HDF5
+from cnpgen.store.files.kind import is_hdf5
+from cnpgen.store.files.limits import TABLE_BYTES, TABLE_COLUMNS
 from cnpgen.store.paths import require_file
 
 Array = NDArray[np.float64]
@@ -34,7 +35,10 @@ def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
         MachineError: The system would not let us read it.
     """
     require_file(path, "a table of tasks, CSV or HDF5")
-    columns = _hdf5_columns(path) if _is_hdf5(path) else _csv_columns(path)
+    try:
+        columns = _hdf5_columns(path) if is_hdf5(path) else _csv_columns(path)
+    except OSError as error:
+        raise MachineError(f"{path}: {error.strerror or error}") from error
     known = {**fields, **{column: field for field in fields.values() for column in field.columns}}
     for name, values in columns.items():
         if name not in known:
@@ -63,14 +67,6 @@ def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Ar
     return np.stack([columns[name] for name in parts], axis=1)
 
 
-def _is_hdf5(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(len(HDF5)) == HDF5
-    except OSError as error:
-        raise MachineError(f"{path}: {error.strerror or error}") from error
-
-
 def _hdf5_columns(path: Path) -> dict[str, Array]:
     with opened_hdf5(path) as file:
         found = {name: column.read() for name, column in file.columns().items()}
@@ -85,16 +81,18 @@ def _hdf5_columns(path: Path) -> dict[str, Array]:
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:
+    if (size := path.stat().st_size) > TABLE_BYTES:
+        raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {TABLE_BYTES:,}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise DatasetError(f"{path} is no table of CSV in UTF-8: {error}") from error
-    except OSError as error:
-        raise MachineError(f"{path}: {error.strerror or error}") from error
     if not lines:
         raise DatasetError(f"{path} is empty: its first line must name columns, such as goal_xyz.x,goal_xyz.y")
     names = [cell.strip() for cell in lines[0][1]]
+    if len(names) > TABLE_COLUMNS:
+        raise DatasetError(f"{path}: line 1 names {len(names):,} columns, expected at most {TABLE_COLUMNS:,}")
     if twice := [name for name in names if names.count(name) > 1]:
         raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
     table = np.array([_numbers_of(path, number, row, names) for number, row in lines[1:]])

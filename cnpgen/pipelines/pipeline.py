@@ -1,5 +1,6 @@
 """Pipeline: how the boundary conditions of a problem are drawn."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,6 +8,8 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import NAME, field
+
+MOST_STAGES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +23,11 @@ class Pipeline:
     )
     stage: tuple[Stage, ...] = field("the steps, in order", form="[[stage]] tables")
     path: Path = Path()
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        if (count := len(self.stage)) > MOST_STAGES:
+            yield "stage", f"there are {count:,} stages, expected at most {MOST_STAGES}"
 
 
 def listed_tasks(pipeline: Pipeline) -> int | None:

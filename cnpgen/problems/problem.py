@@ -23,6 +23,8 @@ from cnpgen.trajectory.spec import TrajectorySpec
 
 Kind = TypeVar("Kind", bound=Constraint)
 
+MOST_TABLES = 100  # obstacles, and constraints
+
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
@@ -70,6 +72,9 @@ class Problem:
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""
+        for key in ("obstacle", "constraint"):
+            if (count := len(getattr(self, key))) > MOST_TABLES:
+                yield key, f"there are {count:,} of them, expected at most {MOST_TABLES}: kernels grow with each"
         depth = max((item.depth for item in self.constraint if isinstance(item, ObjectContact)), default=0.0)
         if self.object is not None and min(self.object.size) <= 2 * depth:
             yield (

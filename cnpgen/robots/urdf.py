@@ -11,7 +11,7 @@ from cnpgen.schema.texts import read_at_most, utf8_text
 MOST_BYTES = 1 << 23
 MOST_PARTS = 1_000  # links, and joints: Pinocchio descends a chain by recursion, and of 5,000 does not come back
 MOST_DEPTH = 64  # elements in one another
-_CONTROL = re.compile("[\x7f-\x9f]")  # those below are no XML
+_CONTROL = re.compile("[\t\n\r\x7f-\x9f]")  # other ones are no XML; parsers make spaces of a file's own line ends
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -26,7 +26,7 @@ class _Builder(ElementTree.TreeBuilder):
         if self._depth > MOST_DEPTH:
             raise ValueError(f"it has more than {MOST_DEPTH} elements in one another")
         for name, value in attrs.items():
-            if _CONTROL.search(value):  # parsers print names as they are
+            if _CONTROL.search(value):  # names are printed, and written into recipes' comments
                 raise ValueError(f"its <{tag} {name}=...> has control characters")
         return super().start(tag, attrs)
 

@@ -128,7 +128,8 @@ def _check_manifest(folder: Path, blueprint: Blueprint) -> tuple[list[Finding], 
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
         findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", advice=MAKE_AGAIN))
     for name in _LISTED:
-        findings += _check_digest(folder, name, manifest["files"][name]["sha256"])
+        entry = manifest["files"][name]
+        findings += _check_file(folder, name, entry["bytes"], entry["sha256"])
     return findings, manifest
 
 
@@ -181,8 +182,8 @@ def check_shard(
 
 def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding]:
     """Compare a file with its recorded size and digest."""
-    found = (folder / name).stat().st_size
-    if found != size:
+    path = folder / name
+    if path.is_file() and (found := path.stat().st_size) != size:
         return [Finding(name, f"has {found} bytes instead of {size}", advice=MAKE_AGAIN)]
     return _check_digest(folder, name, sha256)
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.files.kind import HDF5, PLANS, own_kind
+from cnpgen.store.files.kind import PLANS, is_hdf5, own_kind
 from cnpgen.store.workspace import is_dataset
 
 _SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
@@ -50,9 +50,9 @@ def file_kind(path: Path) -> str:
     try:
         with path.open("rb") as file:
             head = file.read(64)
+        return own_kind(head) or (_hdf5_kind(path) if is_hdf5(path) else "")
     except OSError:
         return ""
-    return own_kind(head) or (_hdf5_kind(path) if head.startswith(HDF5) else "")
 
 
 def _hdf5_kind(path: Path) -> str:

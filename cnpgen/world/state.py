@@ -130,7 +130,8 @@ class World:
         import pinocchio as pin
 
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return np.array(pin.computeFrameJacobian(self._model, self._dynamics_data, self.q, self._tip, frame)[:3])
+        found = pin.computeFrameJacobian(self._model, self._dynamics_data, self.q, self._tip, frame)
+        return np.array(found).reshape(6, -1)[:3]  # Pinocchio gives one column as a vector
 
     @property
     def tip_acceleration(self) -> Array:

@@ -157,12 +157,15 @@ ANSWER = {"degree": 7, "path_control_points": [[0.0]], "rate_control_points": [1
         ({}, "problem is missing"),
         ({"problem": "0"}, "problem must be a whole number"),
         ({"problem": 0, "ending": "planned"}, "planning_s is missing"),
-        ({**PLANNED, "planning_s": "x"}, "planning_s must be a number, got 'x'"),
+        ({**PLANNED, "planning_s": "x"}, "planning_s must be a finite number, got 'x'"),
+        ({**PLANNED, "planning_s": "inf"}, "planning_s must be a finite number, got 'inf'"),
+        ({**PLANNED, "planning_cpu_s": 1e999}, "planning_cpu_s must be a finite number, got inf"),
         ({**PLANNED, "answer": {"t": [0.0]}}, "q is missing"),
         ({**PLANNED, "answer": {**ANSWER, "rate_control_points": "x"}}, "rate_control_points must be a list, got 'x'"),
         ({**PLANNED, "answer": ANSWER}, "verdict is missing"),
         ({"problem": 0, "executed": 5}, "executed must be a table, got 5"),
-        ({"problem": 0, "executed": {"nominal": {"puck_speed_m_s": "x"}}}, "puck_speed_m_s must be a number"),
+        ({"problem": 0, "executed": {"nominal": {"puck_speed_m_s": "x"}}}, "puck_speed_m_s must be a finite number"),
+        ({"problem": 0, "executed": {"nominal": {"hit_time_s": "nan"}}}, "hit_time_s must be a finite number"),
     ],
 )
 def test_a_line_that_is_no_result_is_named(tmp_path: Path, row: Any, text: str) -> None:

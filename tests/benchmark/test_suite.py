@@ -70,6 +70,18 @@ def test_a_grid_without_end_is_refused_before_it_is_made(tmp_path: Path) -> None
         load_suite(tmp_path / "large.toml")
 
 
+def test_problems_without_end_are_refused_before_any_is_drawn(tmp_path: Path) -> None:
+    turns = list_suites()["replan"].read_text(encoding="utf-8")
+    draws = list_suites()["heavy-100"].read_text(encoding="utf-8")
+    for text, message in (
+        (draws.replace("n = 100", f"n = {10**15}"), "is too large, expected at most 100000"),
+        (turns.replace('["350 ms"]', str([0.1] * 500)), "when: 12,000 turns are too many, expected at most 10,000"),
+    ):
+        (tmp_path / "large.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(RecipeError, match=message):
+            load_suite(tmp_path / "large.toml")
+
+
 def test_pucks_need_a_table(tmp_path: Path) -> None:
     text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
     (tmp_path / "heavy.toml").write_text(text.replace('"airhockey"', '"heavy-object"'), encoding="utf-8")

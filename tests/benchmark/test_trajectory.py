@@ -9,6 +9,7 @@ from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, make_plans
+from tests.examples.jerky import jerky_plan
 from tests.examples.plans import load
 
 T = np.linspace(0, 1, 5)
@@ -79,6 +80,25 @@ def test_jumps_in_the_velocity_of_a_linear_trajectory_are_seen_as_accelerations(
     verdict = judge_answer(plan, Trajectory(few.t, few.q))
     margin = verdict.margins["joint acceleration"]
     assert abs(margin.value) > 5 * abs(margin.bound)
+
+
+@pytest.mark.parametrize("known", ["positions", "velocities", "accelerations"])
+def test_jerks_are_judged_where_a_problem_limits_them(known: str) -> None:
+    example = jerky_plan("transport")
+    motion = example.motion
+    plan = make_plans(
+        example.problem, example.boundary, path_control_points=motion.path, rate_control_points=motion.rate
+    )
+    whole = judge_answer(plan, plan)
+    given = sampled(plan, 400)
+    parts = {"positions": (), "velocities": (given.dq,), "accelerations": (given.dq, given.ddq)}[known]
+    verdict = judge_answer(plan, Trajectory(given.t, given.q, *parts))
+    margin, wanted = (each.margins["joint jerk"] for each in (verdict, whole))
+    assert margin.severity > 1
+    if known == "accelerations":
+        assert margin.part == wanted.part
+        assert abs(margin.value) == pytest.approx(abs(wanted.value), rel=0.05)
+        assert verdict.metrics.jerk == pytest.approx(whole.metrics.jerk, rel=0.05)
 
 
 @pytest.mark.slow

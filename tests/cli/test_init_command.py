@@ -237,6 +237,13 @@ def test_a_tip_that_reaches_no_box_is_refused(tmp_path, capsys):
     assert "the tip reaches less than 2 % of every box of positions near" in said
 
 
+def test_an_arm_of_one_joint_is_looked_at_like_any_other(tmp_path, capsys):
+    """Its Jacobian has one column, which Pinocchio gives as a vector."""
+    write_arm(tmp_path / "one.urdf", [("revolute", "0 0 1", LIMIT)])
+    assert main(["init", str(tmp_path / "one"), "--urdf", str(tmp_path / "one.urdf"), "--tip", "end"]) == 2
+    assert "the tip reaches less than 2 % of every box of positions" in capsys.readouterr().err
+
+
 def test_files_that_are_there_are_written_over_only_by_force(tmp_path, capsys):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
     (tmp_path / "arm").mkdir()

@@ -1,5 +1,7 @@
 """Completing tasks from Python and from tables: problems to solve, which task each is, what is wrong with a table."""
 
+import os
+
 import h5py
 import numpy as np
 import pytest
@@ -73,7 +75,9 @@ def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
         file["goal_xyz"], file["hit_angle"] = np.array([[*goal, 0.16] for goal in GOALS]), ANGLES
     with h5py.File(tmp_path / "parts.h5", "w") as file:
         (file["goal_xyz.x"], file["goal_xyz.y"]), file["hit_angle"] = np.array(GOALS).T, ANGLES
-    for name in ("tasks.csv", "tasks.h5", "parts.h5"):
+    with h5py.File(tmp_path / "behind.h5", "w", userblock_size=512) as file:  # the format leaves users a first block
+        file["goal_xyz"], file["hit_angle"] = np.array([[*goal, 0.16] for goal in GOALS]), ANGLES
+    for name in ("tasks.csv", "tasks.h5", "parts.h5", "behind.h5"):
         again = complete_table("airhockey-replan", tmp_path / name)
         assert again.reasons == found.reasons
         np.testing.assert_array_equal(again.plans.boundary.goal_dq, found.plans.boundary.goal_dq)
@@ -91,6 +95,7 @@ def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
         ("goal_xyz.x,goal_xyz.y\n1,2\n\n1,left\n", "line 4: goal_xyz.y must be a number, got 'left'"),
         ("goal_xyz.x,goal_xyz.y\n1,nan\n", "goal_xyz.y must be a finite number in every task, got nan in task 0"),
         ("goal_xyz.x,goal_xyz.x\n1,2\n", "the column 'goal_xyz.x' is there more than once"),
+        (",".join(map(str, range(100_000))) + "\n", "line 1 names 100,000 columns, expected at most 1,000"),
     ],
 )
 def test_a_table_with_a_mistake_is_refused_with_the_place(tmp_path, text, message):
@@ -99,6 +104,13 @@ def test_a_table_with_a_mistake_is_refused_with_the_place(tmp_path, text, messag
     with pytest.raises(DatasetError) as error:
         complete_table("airhockey-replan", path)
     assert message in str(error.value)
+
+
+def test_a_table_of_nothing_but_a_size_is_refused(tmp_path):
+    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,2\n", encoding="utf-8")
+    os.truncate(tmp_path / "tasks.csv", 1 << 40)
+    with pytest.raises(DatasetError, match="has 1,099,511,627,776 bytes, expected a table of at most"):
+        complete_table("airhockey-replan", tmp_path / "tasks.csv")
 
 
 def test_a_table_without_tasks_is_refused(tmp_path):

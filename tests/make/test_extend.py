@@ -1,5 +1,6 @@
 """Datasets that grow: the rows of a larger one beside shards that are not touched."""
 
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -95,6 +96,25 @@ def test_the_notes_in_its_card_stay(tiny, grown):
     assert len(notes) > 100
     assert notes in card
     assert "| `train` | 1,200 | 6 |" in card
+
+
+@pytest.mark.parametrize("what", ["a pipe", "a link to a private file", "too large"])
+def test_a_card_that_is_no_card_gives_no_notes(tiny, tmp_path, what):
+    folder, card, private = tmp_path / "set", tmp_path / "set" / "README.md", tmp_path / "private"
+    shutil.copytree(tiny("airhockey-hit"), folder)
+    text = card.read_text(encoding="utf-8")
+    before = text[text.index("## How it was made") :]
+    secret = text.replace(before, f"a secret\n\n{before}")
+    card.unlink()
+    if what == "a pipe":
+        os.mkfifo(card)
+    elif what == "too large":
+        card.write_text(secret.replace("a secret", "a secret " * 200_000), encoding="utf-8")
+    else:
+        private.write_text(secret, encoding="utf-8")
+        card.symlink_to(private)
+    extend_dataset(folder, ROWS, workers=1)
+    assert "a secret" not in card.read_text(encoding="utf-8")
 
 
 def test_the_same_call_again_and_the_recipe_of_that_size_leave_it_as_it_is(grown):

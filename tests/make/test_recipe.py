@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.load import load_dataset_recipe, load_notes
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.problems.load import load_problem
@@ -168,6 +168,30 @@ def thin_object(folder: Path, size: str) -> Path:
     text = shipped.read_text().replace('urdf = "', f'urdf = "{shipped.parent}/').replace("[0.2, 0.2, 0.3] m", size)
     (folder / "problem.toml").write_text(text)
     return folder / "problem.toml"
+
+
+@pytest.mark.parametrize("key", ["obstacle", "constraint", "stage"])
+def test_there_are_not_more_of_anything_than_kernels_can_be_compiled_for(recipe, key):
+    whole = recipe.pipeline if key == "stage" else load_problem("heavy-object")
+    many = replace(whole, **{key: getattr(whole, key)[:1] * 101})
+    assert [(where, text.partition(" of them")[0].partition(" stages")[0]) for where, text in many.find_mistakes()] == [
+        (key, "there are 101")
+    ]
+    assert list(replace(whole, **{key: getattr(whole, key)[:1] * 100}).find_mistakes()) == []
+
+
+def test_notes_that_are_a_link_to_another_folder_are_not_passed_on(tmp_path):
+    shipped = list_recipes("dataset")["airhockey-hit"]
+    (tmp_path / "private").write_text("a secret")
+    for name, target in (("theirs", tmp_path / "private"), ("mine", "notes.txt")):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "hits.toml").write_text(shipped.read_text())
+        (folder / "notes.txt").write_text("what I saw")
+        (folder / "hits.md").symlink_to(target)
+    with pytest.raises(RecipeError, match=r"hits.md: is a link that leads to another folder"):
+        load_notes(load_dataset_recipe(tmp_path / "theirs" / "hits.toml"))
+    assert load_notes(load_dataset_recipe(tmp_path / "mine" / "hits.toml")) == "what I saw"
 
 
 def test_an_object_must_be_thicker_than_its_contacts_may_be_deep(tmp_path):

@@ -134,12 +134,20 @@ def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monke
         with_inline_meshes(text, file)
 
 
+def test_a_mesh_too_fine_to_be_worked_with_is_refused(tmp_path, monkeypatch):
+    file = write_crane(tmp_path)
+    monkeypatch.setattr("cnpgen.robots.shape.inline.MOST_CORNERS", 5)
+    with pytest.raises(RecipeError, match=r"wedge.stl: the mesh's hull has 6 corners, expected at most 5: simplify"):
+        with_inline_meshes(file.read_text(), file)
+
+
 @pytest.mark.parametrize(
     ("corners", "text"),
     [
         ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "its 4 corners are not those of a body"),
         ([[1, 1, 1]] * 8, "its 8 corners are not those of a body"),
         ([], "a mesh has no corners"),
+        (np.random.default_rng(0).normal(size=(20_000, 3)), "it has 20,000 corners, expected at most 10,000"),
         ([[0, 0, 0], [1e308, 0, 0], [0, 1e308, 0], [0, 0, -1e308]], "it reaches further than 10,000 m"),
         ([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0], [0, 0, 1]], "some that are not finite"),
     ],

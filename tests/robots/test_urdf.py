@@ -59,11 +59,12 @@ def chain(count: int, kind: str = "fixed") -> str:
         ('<!DOCTYPE robot [<!ENTITY a "aaaa">]><robot name="&a;"/>', "it has a document type"),
         (shipped_with(("robot name=", "robot name=")).replace("<robot ", "<robot title='Grün' ", 1).encode("latin-1"),
          r"line \d+: not UTF-8: byte 0xfc; save the URDF as UTF-8"),
+        ('<robot name="r"><link name="a&#10;[robot]"/></robot>', "its <link name=...> has control characters"),
         ("<robot", "it is not XML"),
         (b"", "it is not XML"),
         (b"<robot>" + bytes(8) + b"</robot>", "it is not XML"),
     ],
-    ids=["chain", "depth", "entities", "latin-1", "cut off", "empty", "zeros"],
+    ids=["chain", "depth", "entities", "latin-1", "a line in a name", "cut off", "empty", "zeros"],
 )  # fmt: skip
 def test_what_no_robot_needs_is_a_mistake_in_the_recipe(tmp_path: Path, urdf: str | bytes, message: str) -> None:
     with pytest.raises(RecipeError, match=rf"robot.urdf.*{message}"):

@@ -1,5 +1,6 @@
 """The shallow check: whatever is changed in a dataset is found and named."""
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,6 +36,11 @@ FILES = [
 def problems(folder: Path) -> dict[str, str]:
     """Return what is wrong, file by file."""
     return {item.file: item.problem for item in check_dataset(folder) if not item.note}
+
+
+def test_a_document_of_nothing_but_a_size_is_found_without_reading_it(dataset: Path) -> None:
+    os.truncate(dataset / "README.md", 1 << 40)
+    assert "has 1099511627776 bytes instead of" in problems(dataset)["README.md"]
 
 
 def test_a_good_dataset_has_no_findings_and_every_shard_is_announced(dataset: Path) -> None:

@@ -1,6 +1,7 @@
 """The door for HDF5: plain numbers that are in the file itself come through, everything else is refused by name."""
 
 import ast
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,30 @@ def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
 
 def test_a_device_is_not_a_file() -> None:
     with pytest.raises(DatasetError, match="/dev/zero is not a file"), opened_hdf5(Path("/dev/zero")):
+        pass
+
+
+def test_a_file_of_nothing_but_a_size_is_refused_by_it(tmp_path: Path) -> None:
+    """A sparse file takes no room on a disk or in an archive."""
+    theirs, sealed = write_minimal(tmp_path / "theirs.h5"), tmp_path / "sealed.h5"
+    sealed.write_bytes(under_seal(bytes(BLOCK) + theirs.read_bytes(), kind="cnpgen-plans", version=1))
+    for path, read in (
+        (theirs, load_plans),
+        (sealed, load_plans),
+        (sealed, lambda path: read_sealed(path, kind="cnpgen-model", version=1)),
+    ):
+        os.truncate(path, 1 << 40)
+        with pytest.raises(DatasetError, match=r"has 1,099,511,627,776 bytes, expected at most"):
+            read(path)
+
+
+def test_texts_far_into_a_file_are_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_minimal(tmp_path / "theirs.h5", attributes={"note": "x" * 300})
+    content = bytearray(path.read_bytes())
+    content[content.index(b"GCOL\x01\0\0\0") + 9] ^= 0x20
+    path.write_bytes(content)
+    monkeypatch.setattr("cnpgen.store.files.heaps._PART", 7)
+    with pytest.raises(DatasetError, match="its texts at byte"), opened_hdf5(path):
         pass
 
 

@@ -19,6 +19,7 @@ from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import seeming
 from cnpgen.store.files.sealed import read_sealed
+from cnpgen.store.paths import file_kind
 from cnpgen.store.shard import read_shard
 from cnpgen.validate.dataset import validate_dataset
 
@@ -93,3 +94,10 @@ def test_a_folder_with_a_pipe_in_it_is_looked_at(tmp_path: Path) -> None:
         validate_dataset(tmp_path)
     with pytest.raises(DatasetError, match=r"plan\.json is not a file"):
         load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("block", [0, 512, 2048])
+def test_hdf5_may_begin_with_a_block_of_its_user(tmp_path: Path, block: int) -> None:
+    with h5py.File(tmp_path / "theirs.h5", "w", userblock_size=block) as file:
+        file["path_control_points"] = file["rate_control_points"] = np.zeros(3)
+    assert file_kind(tmp_path / "theirs.h5") == "a file of plans"

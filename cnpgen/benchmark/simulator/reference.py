@@ -58,13 +58,15 @@ def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Arr
         acceleration_limit: How fast joints are stopped after a plan that ends in motion [rad/s^2], shape (n,).
 
     Raises:
-        UsageError: The plan never arrives, or takes longer than ``LONGEST``.
+        UsageError: The plan never arrives, or it or the stop takes longer than ``LONGEST``.
     """
     if not 0 < duration <= LONGEST:
         raise UsageError(f"a plan of {duration:g} s cannot be executed: expected more than 0 and at most {LONGEST:g} s")
     during = states(np.arange(0.0, duration, TICK))
     q, dq, _ = (values[0] for values in states(np.array([duration])))
     stop = max(float(np.max(np.abs(dq) / acceleration_limit)), TICK)
+    if not stop <= LONGEST:
+        raise UsageError(f"a plan after which the arm needs {stop:g} s to stop cannot be executed")
     first = len(during[0]) * TICK - duration  # the first tick after the end
     after = np.minimum(np.append(np.arange(first, stop, TICK), stop), stop)[:, None]
     left = 1 - after / stop

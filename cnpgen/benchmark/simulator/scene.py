@@ -3,6 +3,8 @@
 Nothing collides unless it is named in a pair: the mallet with the puck, the puck with the bands, the held object and
 the arm's links with the obstacles. The table carries the puck, which moves in its plane only; it does not carry the
 mallet, so that every millimetre that the controller is off its height is seen.
+
+Joints and obstacles are called by their numbers: their own names are strangers' texts, and MJCF can name other files.
 """
 
 from collections.abc import Iterator
@@ -92,18 +94,19 @@ def scene_xml(scene: Scene) -> str:
 
 def _arm(scene: Scene) -> Iterator[str]:
     """Yield the nested bodies of the arm; the last one holds the tip and what is fixed to it."""
-    chain, names = scene.robot.chain, scene.robot.joint_names
+    chain = scene.robot.chain
+    last = len(chain.joints) - 1
     ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
-    for index, (joint, name, end, friction) in enumerate(
-        zip(chain.joints, names, ends, joint_friction(scene.problem, scene.robot), strict=True)
+    for index, (joint, end, friction) in enumerate(
+        zip(chain.joints, ends, joint_friction(scene.problem, scene.robot), strict=True)
     ):
         kind = "slide" if joint.prismatic else "hinge"
         place = f'pos="{_numbers(joint.translation)}" quat="{_quaternion(joint.rotation)}"'
         yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
-        yield f'<joint name="{name}" type="{kind}" axis="{_numbers(joint.axis)}" damping="{friction.viscous}"'
-        yield f' frictionloss="{friction.dry}"/>'
+        yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
+        yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
         if np.linalg.norm(end) > SHORTEST:
-            rod = index == len(names) - 1
+            rod = index == last
             radius, colour = (0.012, "0.3 0.3 0.3 1") if rod else (LINK_RADIUS, "1 0.55 0.15 1")
             yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
             yield f' rgba="{colour}"/>'
@@ -112,7 +115,7 @@ def _arm(scene: Scene) -> Iterator[str]:
     if scene.problem.object_size is not None:
         size = _numbers(np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem))
         yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
-    yield "</body>" * (len(names) + 1)
+    yield "</body>" * (len(chain.joints) + 1)
 
 
 def _legal_depth(problem: Problem) -> float:
@@ -132,8 +135,8 @@ def _inertial(joint: Joint, mass: float) -> str:
 
 def _surroundings(scene: Scene) -> Iterator[str]:
     """Yield the obstacles; with a table, the table and its puck."""
-    for obstacle, solid in zip(scene.problem.obstacle, _solids(scene), strict=True):
-        yield f'<geom name="{obstacle.name}" {_shape(obstacle, solid)} rgba="0.6 0.65 0.7 1"/>'
+    for name, obstacle, solid in _obstacles(scene):
+        yield f'<geom name="{name}" {_shape(name, obstacle, solid)} rgba="0.6 0.65 0.7 1"/>'
     if scene.height is None:
         return
     surface = scene.height - hockey.MALLET_HEIGHT
@@ -151,7 +154,7 @@ def _surroundings(scene: Scene) -> Iterator[str]:
     yield ' rgba="0.15 0.15 0.15 1"/></body>'
 
 
-def _shape(obstacle: Obstacle, solid: Solid) -> str:
+def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
     """Write what an obstacle is and where."""
     if isinstance(solid, Box):
         low = solid.low if obstacle.height is not None else np.array([*solid.low[:2], solid.high[2] - DEEP])
@@ -161,19 +164,22 @@ def _shape(obstacle: Obstacle, solid: Solid) -> str:
     if obstacle.kind == "capsule":
         ends = _numbers(np.ravel(solid.position + solid.corners))
         return f'type="capsule" fromto="{ends}" size="{solid.radius!r}"'
-    return f'type="mesh" mesh="{obstacle.name}"'
+    return f'type="mesh" mesh="{name}"'
 
 
 def _meshes(scene: Scene) -> Iterator[str]:
     """Yield the hulls of obstacles that are neither boxes along the world's axes nor round."""
-    for obstacle, solid in zip(scene.problem.obstacle, _solids(scene), strict=True):
+    for name, _, solid in _obstacles(scene):
         if not isinstance(solid, Box) and not solid.radius:
             corners = _numbers(np.ravel(solid.position + solid.corners))
-            yield f'<mesh name="{obstacle.name}" vertex="{corners}"/>'
+            yield f'<mesh name="{name}" vertex="{corners}"/>'
 
 
-def _solids(scene: Scene) -> list[Solid]:
-    return solids_of(scene.problem.obstacle, scene.tops)
+def _obstacles(scene: Scene) -> Iterator[tuple[str, Obstacle, Solid]]:
+    """Yield what obstacles are called here, and what they are."""
+    obstacles = scene.problem.obstacle
+    for number, both in enumerate(zip(obstacles, solids_of(obstacles, scene.tops), strict=True), start=1):
+        yield f"obstacle {number}", *both
 
 
 def _puck(surface: float, height: float) -> Iterator[str]:
@@ -208,9 +214,9 @@ def _pairs(scene: Scene) -> Iterator[str]:
     lengths = [float(np.linalg.norm(joint.translation)) for joint in chain.joints[1:]]
     names = [f"link {index}" for index, length in enumerate(lengths, start=1) if index > 1 and length > SHORTEST]
     names += ["object"] if scene.problem.object_size is not None else []
-    for box in scene.problem.obstacle:
+    for obstacle, _, _ in _obstacles(scene):
         for name in names:
-            yield f'<pair geom1="{name}" geom2="{box.name}" {_SOFT}/>'
+            yield f'<pair geom1="{name}" geom2="{obstacle}" {_SOFT}/>'
 
 
 def _quaternion(rotation: Array) -> str:

@@ -17,6 +17,7 @@ CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # the corners of a cube o
 MOST_PLANES = 24  # that stand for the faces of a hull
 NEAR = math.cos(math.radians(3))  # of the angle between planes that are as good as one
 THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
+MOST_CORNERS = 10_000  # of a body; what is finer takes minutes and proves nothing more
 FARTHEST = 1e4  # m: whatever is further off is no part of a robot
 
 
@@ -27,9 +28,12 @@ def check_solid(corners: Array) -> None:
         corners: The corners [m], shape (V, 3).
 
     Raises:
-        ValueError: There is no body between them.
+        ValueError: There is no body between them, or they are too many.
     """
     from scipy.spatial import ConvexHull, QhullError
+
+    if len(corners) > MOST_CORNERS:
+        raise ValueError(f"it has {len(corners):,} corners, expected at most {MOST_CORNERS:,}")
 
     try:
         ConvexHull(corners)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.files import find_named_file
-from cnpgen.robots.shape.hull import FARTHEST, hull_corners
+from cnpgen.robots.shape.hull import FARTHEST, MOST_CORNERS, hull_corners
 from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
@@ -139,7 +139,11 @@ def _hull_of_file(path: Path, scale: Array) -> Array:
     points = read_mesh(path, scale)[0]
     if not len(points) or not (np.abs(points) <= FARTHEST).all():
         raise RecipeError([f"{path}: the mesh has no points, or some further off than {FARTHEST:,.0f} m"])
-    return hull_corners(points)
+    corners = hull_corners(points)
+    if len(corners) > MOST_CORNERS:
+        found = f"the mesh's hull has {len(corners):,} corners"
+        raise RecipeError([f"{path}: {found}, expected at most {MOST_CORNERS:,}: simplify the mesh"])
+    return corners
 
 
 def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:

@@ -2,13 +2,15 @@
 
 A form is one of
 
-* ``TEXT``, ``WHOLE`` (from 0 to 2^63 - 1), ``NUMBER`` (infinities are texts that ``float`` reads), ``ANYTHING``;
+* ``TEXT``, ``WHOLE`` (from 0 to 2^63 - 1), ``NUMBER`` (infinities are texts that ``float`` reads), ``FINITE``,
+  ``ANYTHING``;
 * ``Maybe(form)``: that, or null;
 * ``[form]``: a list of such values;
 * ``{"key": form}``: a table with these keys and perhaps others, which are not looked at;
 * ``{EVERY: form}``: a table with any keys and such values.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -27,10 +29,11 @@ class Leaf(Enum):
     TEXT = "a text"
     WHOLE = f"a whole number from 0 to {LARGEST}"
     NUMBER = "a number"
+    FINITE = "a finite number"
     ANYTHING = "anything"
 
 
-TEXT, WHOLE, NUMBER, ANYTHING = Leaf
+TEXT, WHOLE, NUMBER, FINITE, ANYTHING = Leaf
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def _are(values: list[Any], leaf: Leaf) -> bool:
     kinds = set(map(type, values))
     if kinds == {int}:
         low = 0 if leaf is WHOLE else -LARGEST
-        return leaf in {WHOLE, NUMBER} and low <= min(values) and max(values) <= LARGEST
+        return leaf in {WHOLE, NUMBER, FINITE} and low <= min(values) and max(values) <= LARGEST
     return (leaf is NUMBER and kinds == {float}) or (leaf is TEXT and kinds == {str})
 
 
@@ -125,7 +128,8 @@ def _is(value: Any, leaf: Leaf) -> bool:
         return isinstance(value, int) and 0 <= value <= LARGEST
     if isinstance(value, int):
         return abs(value) <= LARGEST
-    return isinstance(value, float) or (isinstance(value, str) and value in _NOT_FINITE)
+    finite = isinstance(value, float) and math.isfinite(value)
+    return finite or (leaf is NUMBER and (isinstance(value, float) or value in _NOT_FINITE))
 
 
 def _wrong(expected: str, value: Any) -> FormError:

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.attributes import Attributes, decoded
 from cnpgen.store.files.heaps import check_heaps
 from cnpgen.store.files.kind import seeming
-from cnpgen.store.files.limits import ALWAYS, EXPANSION, MOST_DIMENSIONS, MOST_NAMES
+from cnpgen.store.files.limits import ALWAYS, EXPANSION, MOST_BYTES, MOST_DIMENSIONS, MOST_NAMES
 
 _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # what h5py raises on broken files
 _SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
@@ -184,8 +184,9 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         content: What is in it, if that was read already.
 
     Raises:
-        DatasetError: The file is missing, no HDF5 file, damaged or cut off, as opening or the block finds out.
-        MachineError: The system would not let us read it.
+        DatasetError: The file is missing, no HDF5 file, too large, damaged or cut off, as opening or the block finds
+            out.
+        MachineError: The system would not let us read it, or what is read is more than the memory holds.
     """
     import h5py
 
@@ -196,6 +197,8 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         source: Any = path if content is None else io.BytesIO(content)
         with h5py.File(source, "r", locking="best-effort" if content is None else None) as file:
             yield Hdf5(path, Attributes(path, file.id), file.id, size)
+    except MemoryError as error:
+        raise MachineError(f"cannot read {path}: what is in it does not fit into memory") from error
     except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
@@ -204,12 +207,23 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
+def require_possible_size(path: Path) -> int:
+    """Return the size of a file [bytes]; a file of nothing but a size can be sent in a few bytes.
+
+    Raises:
+        DatasetError: It is larger than any of cnpgen's.
+    """
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise DatasetError(f"{path} has {size:,} bytes, expected at most {MOST_BYTES:,}")
+    return size
+
+
 def _check_bytes(path: Path, content: bytes | None) -> int:
     """Refuse damage on which HDF5 would hang; return the size of the file [bytes]."""
     if content is not None:
         check_heaps(path, np.frombuffer(content, np.uint8))
         return len(content)
-    if path.stat().st_size == 0:  # what is empty cannot be mapped
+    if require_possible_size(path) == 0:  # what is empty cannot be mapped
         return 0
     try:
         found: NDArray[np.uint8] = np.memmap(path, np.uint8, "r")

@@ -10,6 +10,7 @@ from cnpgen.errors import DatasetError
 
 _BEGIN = np.frombuffer(b"GCOL\x01\0\0\0", "<u8")[0]  # of a collection: signature and version; as a number 7e-315
 _HEADER = 16  # bytes, of a collection and of each object in it
+_PART = 1 << 20  # words that are looked at together: a comparison needs memory of its own
 
 
 def check_heaps(path: Path, content: NDArray[np.uint8]) -> None:
@@ -26,9 +27,10 @@ def check_heaps(path: Path, content: NDArray[np.uint8]) -> None:
         DatasetError: There is such a collection.
     """
     words = content[: len(content) // 8 * 8].view("<u8")  # collections begin at multiples of 8 bytes
-    for word in np.flatnonzero(words == _BEGIN).tolist():
-        if not _adds_up(content, 8 * word):
-            raise DatasetError(f"{path} is damaged: its texts at byte {8 * word} cannot be read")
+    for first in range(0, len(words), _PART):
+        for word in (first + np.flatnonzero(words[first : first + _PART] == _BEGIN)).tolist():
+            if not _adds_up(content, 8 * word):
+                raise DatasetError(f"{path} is damaged: its texts at byte {8 * word} cannot be read")
 
 
 def _adds_up(content: NDArray[np.uint8], begin: int) -> bool:

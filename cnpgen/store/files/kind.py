@@ -15,6 +15,7 @@ _SIGNATURES = {
 }
 PLANS = "a file of plans"
 _HEAD = 256  # bytes that are looked at
+_BEGINNINGS = (0, 512, 1024, 2048)  # bytes, where HDF5 files of users begin
 
 
 def own_kind(head: bytes) -> str:
@@ -26,6 +27,16 @@ def own_kind(head: bytes) -> str:
 def kind_name(word: str) -> str:
     """Name a kind of file by the word that its seal has for it: "a model of cnpgen", or "a file of plans"."""
     return PLANS if word == "plans" else f"a {word} of cnpgen"
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether a file is HDF5, by its signature, which may follow a block that the format leaves to the user.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        return any(file.seek(place) == place and file.read(len(HDF5)) == HDF5 for place in _BEGINNINGS)
 
 
 def seeming(path: Path) -> str:

@@ -4,11 +4,17 @@ Recipes have limits of their own (``cnpgen.schema.toml``), and so have URDFs (``
 """
 
 # HDF5
+MOST_BYTES = 1 << 36  # of a file
+SEALED_BYTES = 1 << 30  # of a model or a checkpoint, which are read as a whole
 EXPANSION = 100  # the numbers of a file, unpacked, may be so many times larger than the file ...
 ALWAYS = 1 << 24  # ... or take this many bytes, whatever the file's size
 MOST_DIMENSIONS = 4  # of a dataset
 MOST_NAMES = 10_000  # of datasets in a file, or of attributes
 MOST_ATTRIBUTE_BYTES = 1 << 24  # of an attribute: texts of URDFs are the largest
+
+# CSV
+TABLE_BYTES = 1 << 28
+TABLE_COLUMNS = 1_000
 
 # JSON
 DOCUMENT_BYTES = 1 << 25  # a manifest of 50,000 shards has 21 MB

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import machine_error, read_file, write_file
-from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
+from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5, require_possible_size
 from cnpgen.store.files.kind import kind_name, seeming
+from cnpgen.store.files.limits import SEALED_BYTES
 
 BLOCK = 512  # bytes of the seal
 _SEAL = re.compile(rb"(cnpgen-[a-z]+) ([0-9]{1,6})\nsha256 ([0-9a-f]{64})\n")
@@ -87,7 +88,7 @@ def has_seal(path: Path, *, kind: str, version: int) -> bool:
         version: The newest version of its format that the caller understands.
 
     Raises:
-        DatasetError: It is cut off, damaged, or from a newer cnpgen.
+        DatasetError: It is cut off, damaged, too large, or from a newer cnpgen.
         MachineError: The system would not let us read it.
     """
     try:
@@ -95,6 +96,7 @@ def has_seal(path: Path, *, kind: str, version: int) -> bool:
             block = file.read(BLOCK)
             if not block.startswith(f"{kind} ".encode()):
                 return False
+            require_possible_size(path)
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise machine_error("read", path, error) from error
@@ -128,10 +130,10 @@ def read_sealed(path: Path, *, kind: str, version: int) -> Content:
         version: The newest version of its format that the caller understands.
 
     Raises:
-        DatasetError: It is missing, of another kind, cut off, damaged, or from a newer cnpgen.
+        DatasetError: It is missing, of another kind, too large, cut off, damaged, or from a newer cnpgen.
         MachineError: The system would not let us read it.
     """
-    data = read_file(path)
+    data = read_file(path, most=SEALED_BYTES)
     _check_seal(path, data[:BLOCK], hashlib.sha256(data[BLOCK:]).hexdigest(), kind=kind, version=version)
     with opened_hdf5(path, data) as file:
         values = {name: item.read() for name, item in file.columns().items()}

@@ -1,6 +1,8 @@
 """The simulated arm is the URDF's: its dynamics are Pinocchio's, and it keeps its energy where nothing brakes it."""
 
 from dataclasses import replace
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
@@ -45,6 +47,24 @@ def with_tool() -> Scene:
 
 def test_a_tool_and_a_payload_of_the_problem_are_simulated() -> None:
     compare_with_pinocchio(with_tool())
+
+
+def test_names_of_strangers_are_no_part_of_the_scene(tmp_path: Path) -> None:
+    """Joints and obstacles may be called anything; what MuJoCo reads names no other file."""
+    name = f'x"/><include file="{tmp_path / "private.xml"}"/><geom name="'
+    shipped, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
+    problem = replace(
+        shipped,
+        robot=replace(shipped.robot, joints=(name, *shipped.robot.joints[1:])),
+        obstacle=tuple(replace(each, name=f"{name}{number}") for number, each in enumerate(shipped.obstacle)),
+    )
+    text = robot.urdf_text.replace('"joint_1"', quoteattr(name))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(text, encoding="utf-8")
+    problem = replace(problem, robot=replace(problem.robot, urdf=str(urdf)))
+    strange = Scene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
+    assert "private" not in scene_xml(strange)
+    assert mujoco.MjModel.from_xml_string(scene_xml(strange)).nq == 7
 
 
 def test_motors_saturate_at_the_torques_of_the_problem() -> None:
@@ -132,7 +152,7 @@ def test_obstacles_of_every_kind_are_as_far_away_as_judges_say(kind: str) -> Non
     problem, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
     random = np.random.default_rng(6)
     obstacles = tuple(draw_obstacle(kind, random, spread=0.5) for _ in range(3))
-    problem = replace(problem, obstacle=tuple(replace(each, name=f"it {i}") for i, each in enumerate(obstacles)))
+    problem = replace(problem, obstacle=obstacles)
     tops = place_obstacles(problem.obstacle)
     model = mujoco.MjModel.from_xml_string(scene_xml(Scene(problem, robot, PLANTS["nominal"], tops)))
     data, world = mujoco.MjData(model), World(robot, problem.obstacle, problem.object_size)
@@ -142,7 +162,7 @@ def test_obstacles_of_every_kind_are_as_far_away_as_judges_say(kind: str) -> Non
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         for index, expected in enumerate(world.object_distances()):
-            geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"it {index}")
+            geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"obstacle {index + 1}")
             found = mujoco.mj_geomDistance(model, data, held, geom, 10.0, None)
             if expected > 0.01:  # the object is 2 mm smaller on every side than it is judged
                 assert 0 <= found - expected < 0.004

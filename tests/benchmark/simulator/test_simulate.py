@@ -144,6 +144,13 @@ def test_a_plan_that_is_none_is_not_executed_and_the_others_are(hit: Plans) -> N
     assert found.summary()["plans"] == 2
 
 
+def test_a_plan_that_ends_too_fast_to_be_stopped_is_not_executed(hit: Plans) -> None:
+    rate = hit.rate_control_points.copy()
+    rate[:, -1] = 1e9
+    (found,) = simulate_plans(replace(hit, rate_control_points=rate), workers=1).executed
+    assert "s to stop cannot be executed" in found.failure
+
+
 def test_an_unknown_plant_is_refused_by_name() -> None:
     with pytest.raises(UsageError, match=r"unknown plant 'heavyer'.*did you mean 'heavier'"):
         as_plant("heavyer")
