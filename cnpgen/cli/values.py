@@ -57,6 +57,14 @@ def natural(text: str) -> int:
     return _at_least(0, text, "7")
 
 
+def port(text: str) -> int:
+    """Read the number of a port, 0 for any that is free."""
+    number = natural(text)
+    if number > 65535:
+        raise ArgumentTypeError(f"expected a port, 0 to 65535, got {text!r}")
+    return number
+
+
 def seed(text: str) -> int:
     """Read a root seed, 0 to 2^63 - 1."""
     number = natural(text)

@@ -15,7 +15,8 @@ _TEXT = """\
 One file that needs no network: the arm with its meshes, its obstacles, the path of its tip, a slider of time, and its
 joints against their limits. A plan moves; a row without a plan is shown at its start and its goal, a problem in its
 base configuration. Plans and datasets hold the shape that judges see, and no meshes: --problem names the file that
-leads to them. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
+leads to them. --serve shows the page at an address of this machine instead, until Ctrl-C, and again when a file
+behind it changes; ?row=I at its end shows another row. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
 """
 
 
@@ -28,7 +29,10 @@ def add(commands: "Commands[Parser]") -> None:
     option("--split", metavar="NAME", help="which split of the folder (default: validation)")
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", help=text)
-    option("-o", "--out", metavar="OUT", type=_page, help="where to (default: NAME.html here)")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("-o", "--out", metavar="OUT", type=_page, help="where to (default: NAME.html here)")
+    text = "serve the page on this machine, and show every change of its files (default port: 8000)"
+    where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
 
 
 def _page(text: str) -> str:
@@ -41,9 +45,28 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.store.files.atomic import write_file
 
     what = Path(arguments.what)
+    if arguments.serve is not None:
+        return _serve(arguments)
     out = Path(arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html")
     write_file(out, page_of(_scene(arguments)))
     print(out)
+    return 0
+
+
+def _serve(arguments: argparse.Namespace) -> int:
+    """Serve the page until somebody interrupts."""
+    from cnpgen.cli.view.page import page_of
+    from cnpgen.cli.view.serve import serve
+    from cnpgen.store.layout import PLAN
+
+    def page(row: int | None, stamp: str) -> str:
+        shown = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row}))
+        return page_of(_scene(shown), stamp=stamp)
+
+    _scene(arguments)  # what is wrong is said before there is an address
+    files = [Path(given) for given in (arguments.what, arguments.problem) if given and Path(given).exists()]
+    watched = [path / PLAN if path.is_dir() else path for path in files]
+    serve(page, watched, port=arguments.serve, ready=lambda address: print(address, flush=True))
     return 0
 
 

@@ -4,7 +4,14 @@ import base64
 import json
 import re
 import shutil
+import signal
+import socket
 import subprocess
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,6 +23,7 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.cli.view.bodies import robot_bodies, tube, wrapped
+from cnpgen.cli.view.serve import stamp
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from tests.conftest import HANGING
@@ -40,7 +48,10 @@ needs_meshcat = pytest.mark.skipif(not _has_meshcat(), reason="MeshCat is not in
 
 def content(page: Path) -> dict[str, Any]:
     """What a page shows."""
-    text = page.read_text(encoding="utf-8")
+    return in_page(page.read_text(encoding="utf-8"))
+
+
+def in_page(text: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.S)[1])
     return found
 
@@ -205,6 +216,8 @@ def test_a_line_is_a_tube_round_its_points():
         (["airhockey", "--split", "train"], "--split is for plans and for the folder of a dataset, got airhockey"),
         (["airhockey", "--problem", "airhockey"], "--problem is for plans and for the folder of a dataset"),
         (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
+        (["airhockey", "--serve", "65536"], "expected a port, 0 to 65535, got '65536'"),
+        (["airhockey", "--serve", "-o", "page.html"], "not allowed with"),
         (["airhokey"], "unknown problem, pipeline or dataset 'airhokey' (did you mean 'airhockey'?)"),
     ],
 )
@@ -252,12 +265,82 @@ def test_without_the_viewer_it_is_said_what_to_install(monkeypatch, capsys):
     assert "pip install 'cnpgen[view]'" in capsys.readouterr().err
 
 
-def chromium(page: Path, *options: str) -> str:
+@contextmanager
+def served(*words: str) -> Iterator[str]:
+    """The address of what ``cnpgen view --serve`` serves; in the end it is interrupted."""
+    command = [sys.executable, "-m", "cnpgen", "view", *words, "--serve", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.send_signal(signal.SIGINT)
+    assert process.returncode == 130
+
+
+def got(address: str, **headers: str) -> tuple[int, dict[str, str], str]:
+    request = urllib.request.Request(address, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=HANGING) as answer:
+            return answer.status, dict(answer.headers), answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, dict(error.headers), error.read().decode()
+
+
+@needs_meshcat
+def test_a_page_is_served_to_this_machine_and_follows_its_files(plans, tmp_path):
+    file = tmp_path / "plans.h5"
+    shutil.copy(plans, file)
+    with served(str(file)) as address:
+        status, _, text = got(address)
+        assert (status, in_page(text)["title"]) == (200, "heavy-object: plans.h5, plan 0")
+        assert in_page(got(f"{address}?row=1")[2])["title"] == "heavy-object: plans.h5, plan 1"
+        assert got(f"{address}stamp")[2] == in_page(text)["stamp"] != ""
+        status, headers, said = got(f"{address}?row=2")
+        assert (status, headers["Refresh"]) == (500, "2")
+        assert "has no plan 2" in said
+        assert "expected a number from 0" in got(f"{address}?row=-1")[2]
+        assert got(f"{address}../plans.h5")[0] == 404
+        assert got(address, Host="a.stranger.example:80")[0] == 403
+        file.write_bytes(b"no plan")
+        assert got(f"{address}stamp")[2] != in_page(text)["stamp"]
+        assert got(address)[0] == 500
+
+
+@needs_meshcat
+def test_a_change_beside_a_recipe_is_seen(tmp_path):
+    file = write_problem(tmp_path)
+    before = stamp([file])
+    (file.parent / "crane.urdf").write_text("<robot/>")
+    assert stamp([file]) != before
+
+
+@needs_meshcat
+@needs_chromium
+def test_a_browser_runs_the_page_that_is_served(plans):
+    with served(str(plans)) as address:
+        assert 'data-ready="yes"' in chromium(plans, "--dump-dom", address=address)
+
+
+def test_a_port_that_is_taken_is_said(capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["view", "airhockey", "--serve", str(port)]) == 3
+    assert f"cannot listen on port {port}" in capsys.readouterr().err
+
+
+def chromium(page: Path, *options: str, address: str = "") -> str:
     """Open a page from disk in a browser without a screen; return what it prints."""
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
     flags += ["--disable-sync", f"--user-data-dir={page.parent / 'browser'}", "--window-size=1200,700"]
-    command = [str(CHROMIUM), *flags, "--virtual-time-budget=8000", *options, f"{page.as_uri()}#moment=120&ends"]
+    command = [
+        str(CHROMIUM),
+        *flags,
+        "--virtual-time-budget=8000",
+        *options,
+        f"{address or page.as_uri()}#moment=120&ends",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
     return done.stdout
 

@@ -21,14 +21,18 @@ _NOTES = {
 _DIGITS = 4  # of shares of limits
 
 
-def page_of(scene: Scene) -> str:
+def page_of(scene: Scene, *, stamp: str = "") -> str:
     """Write a scene as a page.
+
+    Args:
+        scene: The scene.
+        stamp: Of the files behind it, for a page that is loaded again when the server has another one.
 
     Raises:
         MachineError: MeshCat is not installed.
     """
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    data = json.dumps(_content(scene), separators=(",", ":")).replace("<", "\\u003c")
+    data = json.dumps(_content(scene) | {"stamp": stamp}, separators=(",", ":")).replace("<", "\\u003c")
     before, between = template.split("/*VIEWER*/")
     return before + _viewer() + between.replace("/*DATA*/", data)
 

@@ -1,0 +1,87 @@
+"""A page that this machine serves to itself, made again when a file behind it changes."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+from cnpgen.errors import CnpgenError, MachineError, UsageError
+
+HOST = "127.0.0.1"
+_NAMES = (HOST, "localhost")  # of this machine, in requests: a stranger's page that has led here says another one
+_REPAIRED = 2  # s: how soon a browser asks again where there was no page
+
+Page = Callable[[int | None, str], str]
+
+
+def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[str], None]) -> None:
+    """Serve a page until the process is interrupted.
+
+    ``/?row=I`` shows another row. An open page looks every second whether it is out of date, and is then loaded again.
+
+    Args:
+        page: (row or None, stamp of the files) -> the page as HTML. What it refuses is told in the page's place.
+        watched: The files that the page shows; of a recipe the other files in its folder count, too.
+        port: Where to listen, on this machine alone; 0 for any port that is free.
+        ready: Called with the address once it is served.
+
+    Raises:
+        MachineError: The port is taken.
+    """
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            address = urlsplit(self.path)
+            if (self.headers.get("Host") or "").rpartition(":")[0] not in _NAMES:
+                self._answer("expected the address of this machine", status=HTTPStatus.FORBIDDEN)
+            elif address.path == "/stamp":
+                self._answer(stamp(watched))
+            elif address.path == "/":
+                self._show(parse_qs(address.query).get("row", [""])[-1])
+            else:
+                self._answer("there is one page, /", status=HTTPStatus.NOT_FOUND)
+
+        def _show(self, row: str) -> None:
+            try:
+                if row and not (row.isascii() and row.isdigit()):
+                    raise UsageError(f"row: expected a number from 0, got {row[:20]!r}")
+                self._answer(page(int(row) if row else None, stamp(watched)), kind="text/html")
+            except CnpgenError as error:
+                self._answer(str(error), status=HTTPStatus.INTERNAL_SERVER_ERROR)
+
+        def _answer(self, text: str, *, kind: str = "text/plain", status: HTTPStatus = HTTPStatus.OK) -> None:
+            body = text.encode()
+            self.send_response(status)
+            self.send_header("Content-Type", f"{kind}; charset=utf-8")
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Cache-Control", "no-store")
+            if status is HTTPStatus.INTERNAL_SERVER_ERROR:
+                self.send_header("Refresh", str(_REPAIRED))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            """Say nothing of requests."""
+
+    try:
+        server = HTTPServer((HOST, port), Handler)
+    except OSError as error:
+        raise MachineError(f"--serve: cannot listen on port {port}: {error.strerror}") from error
+    with server:
+        ready(f"http://{HOST}:{server.server_port}/")
+        server.serve_forever()
+
+
+def stamp(watched: Sequence[Path]) -> str:
+    """Return what changes when one of the files does."""
+    files = [each for path in watched for each in (path.parent.glob("*") if path.suffix == ".toml" else (path,))]
+    return " ".join(sorted(map(_state, files)))
+
+
+def _state(path: Path) -> str:
+    with suppress(OSError):
+        status = path.stat()
+        return f"{path.name}:{status.st_mtime_ns}:{status.st_size}"
+    return f"{path.name}:missing"
