@@ -58,6 +58,8 @@ def _paper_mistakes(table: dict[str, Any], where: Place) -> Iterator[str]:
     for place, _ in _constraints(table, "self-clearance"):
         text = 'links are kept apart by their shapes: it needs geometry = "urdf" in [robot], and <collision> elements'
         yield (where / "constraint" / place).says(text)
+    if _robot(table).get("convex_parts", 1) != 1:
+        yield (where / "robot" / "convex_parts").says('meshes matter with geometry = "urdf" only')
     if _robot(table).get("srdf"):
         yield (where / "robot" / "srdf").says('pairs of links matter with geometry = "urdf" only')
 

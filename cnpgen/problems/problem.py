@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+from cnpgen.errors import MachineError
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.robots.obstacle import Obstacle
@@ -123,7 +124,8 @@ class Problem:
         text, spec = read_urdf(self.urdf_path), self.robot
         if spec.geometry != "urdf":
             return text
-        text = with_inline_meshes(text, self.urdf_path, self._packages)
+        keep = kept_folder() if spec.convex_parts > 1 else None
+        text = with_inline_meshes(text, self.urdf_path, self._packages, most=spec.convex_parts, keep=keep)
         return with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
 
     @cached_property
@@ -137,11 +139,20 @@ class Problem:
         return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
 
 
-FILES = (
-    "urdf",
-    "packages",
-    "srdf",
-)  # keys of [robot] that say where something is: what was there is in the URDF's text
+# Keys of [robot] that say where something is or how it is read: what came of it is in the URDF's text.
+FILES = ("urdf", "packages", "srdf", "convex_parts")
+
+
+def kept_folder() -> Path | None:
+    """Return the folder where shapes are kept, beside the kernels; None where others may change it."""
+    from cnpgen.kernels.cache import default_cache_folder, distrusted, make_private  # only robots with a shape need it
+
+    try:
+        folder = default_cache_folder()
+        make_private(folder)
+    except (OSError, MachineError):
+        return None
+    return None if distrusted(folder) else folder
 
 
 def resolved(recipe: object) -> dict[str, Any]:

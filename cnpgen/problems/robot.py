@@ -3,15 +3,14 @@
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, RecipeError
+from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.attached import Attached, Body
 from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.robot import Robot, reduced_model
@@ -93,22 +92,10 @@ def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
     return np.broadcast_to(np.array(values.values), len(otherwise)).copy()
 
 
-def _keep() -> Path | None:
-    """Return the folder where capsules and pairs are kept, beside the kernels; None where others may change it."""
-    from cnpgen.kernels.cache import default_cache_folder, distrusted, make_private  # only robots with a shape need it
-
-    try:
-        folder = default_cache_folder()
-        make_private(folder)
-    except (OSError, MachineError):
-        return None
-    return None if distrusted(folder) else folder
-
-
 def _shape(problem: Problem, robot: Robot) -> Shape:
     """Load the shape of the robot; warn of collisions that an SRDF disables, where the problem's file names one."""
     try:
-        shape = load_shape(robot.urdf_text, robot.model, _keep())
+        shape = load_shape(robot.urdf_text, robot.model, kept_folder())
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
     for pair in shape.pairs if problem.robot.srdf else ():

@@ -37,6 +37,13 @@ class RobotSpec:
     packages: tuple[str, ...] = field(
         "folders, relative to the problem file, in which package:// in the URDF is looked up", default=(), late=True
     )
+    convex_parts: int = field(
+        "into how many convex parts a collision mesh that is far from convex may be taken apart; 1 for its convex hull",
+        default=1,
+        low=1,
+        high=64,
+        late=True,
+    )
     srdf: str = field(
         "SRDF file, relative to the problem file, whose disabled pairs of links are not kept apart; without it they are"
         " found by sampling",

@@ -15,7 +15,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.files import find_named_file
-from cnpgen.robots.shape.inline import read_mesh, scale_of
+from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.piece import origin_of, piece_of
 from cnpgen.robots.urdf import urdf_tree
 
@@ -145,9 +145,7 @@ def _visual(
         return body.corners, body.triangles
     rotation, translation = origin_of(element.find("origin"))
     points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), urdf, packages), scale_of(mesh))
-    sides = [loaded.tri_indices(number) for number in range(loaded.num_tris)]
-    triangles = np.array([(side[0], side[1], side[2]) for side in sides], np.int64).reshape(-1, 3)
-    return points @ rotation.T + translation, triangles
+    return points @ rotation.T + translation, sides_of(loaded)
 
 
 def _placed(placement: "pin.SE3", points: Array) -> Array:

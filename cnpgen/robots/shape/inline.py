@@ -5,6 +5,7 @@ A plan, a dataset or a planner carries its problem as text; so the shape of the 
 
 import base64
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.files import find_named_file
 from cnpgen.robots.shape.hull import FARTHEST, MOST_CORNERS, hull_corners
+from cnpgen.robots.shape.parts import convex_parts
 from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
@@ -28,37 +30,61 @@ MOST_MESH_BYTES = 1 << 26  # of a file
 _CAPSULES = "1.2"  # the version of URDF that has capsules
 
 
-def with_inline_meshes(urdf: str, path: Path, packages: Sequence[Path] = ()) -> str:
+def with_inline_meshes(
+    urdf: str, path: Path, packages: Sequence[Path] = (), *, most: int = 1, keep: Path | None = None
+) -> str:
     """Return a URDF with the hulls of its collision meshes in it; one that needs no change is returned as it is.
 
     Args:
         urdf: The text of the URDF.
         path: Its file, from which the meshes' places are told.
         packages: Folders in which packages are looked for.
+        most: Into how many convex parts a mesh may be taken apart; 1 for its hull.
+        keep: Folder in which parts are kept; None to keep nothing.
 
     Raises:
         RecipeError: A mesh is missing or cannot be read; with all of them.
+        MachineError: Meshes are to be taken apart, and CoACD is not installed.
     """
     try:
         tree = urdf_tree(urdf)
     except ValueError:  # whoever reads the robot says so
         return urdf
-    meshes = [mesh for mesh in tree.iterfind(".//collision/geometry/mesh") if not is_inline(mesh.get("filename", ""))]
+    elements = [(link, element) for link in tree.iter("link") for element in link.findall("collision")]
+    meshes = [(link, element, mesh) for link, element in elements if (mesh := _mesh_file(element)) is not None]
     mistakes: list[str] = []
-    for mesh in meshes:
+    for link, element, mesh in meshes:
         try:
-            address = inline_mesh(find_named_file(mesh.get("filename", ""), path, packages), scale_of(mesh))
+            file = find_named_file(mesh.get("filename", ""), path, packages)
+            addresses = [address_of(each) for each in _parts_of_file(file, scale_of(mesh), most, keep)]
         except RecipeError as error:
             mistakes += error.mistakes
         else:
-            mesh.set("filename", address)
             mesh.attrib.pop("scale", None)
+            _replace(link, element, mesh, addresses)
     if mistakes:
         raise RecipeError(list(dict.fromkeys(mistakes)))
     unversioned = tree.find(".//collision/geometry/capsule") is not None and tree.get("version", "1.0") < _CAPSULES
     if unversioned:  # URDF's parser would complain on stderr about what it then leaves out
         tree.set("version", _CAPSULES)
     return ElementTree.tostring(tree, encoding="unicode") if meshes or unversioned else urdf
+
+
+def _mesh_file(collision: ElementTree.Element) -> ElementTree.Element | None:
+    """Return the mesh of a <collision> element if it is one in a file."""
+    mesh = collision.find("geometry/mesh")
+    return None if mesh is None or is_inline(mesh.get("filename", "")) else mesh
+
+
+def _replace(
+    link: ElementTree.Element, collision: ElementTree.Element, mesh: ElementTree.Element, addresses: list[str]
+) -> None:
+    """Put convex parts, each in an element of its own, in the place of a mesh."""
+    place = list(link).index(collision)
+    link.remove(collision)
+    for address in reversed(addresses):
+        mesh.set("filename", address)
+        link.insert(place, deepcopy(collision))
 
 
 def mesh_files(urdf: str) -> list[str]:
@@ -94,7 +120,7 @@ def inline_mesh(path: Path, scale: Array) -> str:
     Raises:
         RecipeError: It cannot be read.
     """
-    return address_of(_hull_of_file(path, scale))
+    return address_of(*_parts_of_file(path, scale, 1, None))
 
 
 def address_of(corners: Array) -> str:
@@ -134,16 +160,25 @@ def scale_of(mesh: ElementTree.Element) -> Array:
     return scale
 
 
-def _hull_of_file(path: Path, scale: Array) -> Array:
-    """Return the corners of the convex hull of a mesh [m]."""
-    points = read_mesh(path, scale)[0]
+def _parts_of_file(path: Path, scale: Array, most: int, keep: Path | None) -> list[Array]:
+    """Return the corners of a mesh's convex hull, or of its convex parts [m]."""
+    points, mesh = read_mesh(path, scale)
     if not len(points) or not (np.abs(points) <= FARTHEST).all():
         raise RecipeError([f"{path}: the mesh has no points, or some further off than {FARTHEST:,.0f} m"])
-    corners = hull_corners(points)
-    if len(corners) > MOST_CORNERS:
-        found = f"the mesh's hull has {len(corners):,} corners"
+    try:
+        parts = [hull_corners(points)] if most == 1 else convex_parts(points, sides_of(mesh), most, keep)
+    except RecipeError as error:
+        raise RecipeError([f"{path}: {text}" for text in error.mistakes]) from error
+    if (corners := max(map(len, parts))) > MOST_CORNERS:
+        found = f"the mesh's hull has {corners:,} corners"
         raise RecipeError([f"{path}: {found}, expected at most {MOST_CORNERS:,}: simplify the mesh"])
-    return corners
+    return parts
+
+
+def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
+    """Return the triangles of a mesh as numbers of its points, shape (T, 3)."""
+    sides = [mesh.tri_indices(number) for number in range(mesh.num_tris)]
+    return np.array([[side[0], side[1], side[2]] for side in sides], np.int64).reshape(-1, 3)
 
 
 def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
