@@ -36,7 +36,7 @@ from cnpgen.store.files.atomic import write_file
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 PACKAGE = Path(__file__).parents[1]
-ROOMS = ("robots", "symbolic", "kernels", "problems", "trajectory")  # what builders of any room import
+ROOMS = ("robots", "kernels", "problems", "trajectory")  # what builders of any room import
 SLOWER = "10 to 20 times slower than compiled code"  # benchmarks/generator.py measures it: 9 to 24
 
 

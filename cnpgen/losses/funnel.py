@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.losses.integrand import has_funnel, stated
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -8,13 +8,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.kernels.symbolic.state import HeldState, SymbolicState, jerk_along
 from cnpgen.kernels.tape import Axes, GridSpec
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.state import HeldState, SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics
+from cnpgen.kernels.symbolic.linalg import Vec, add, dot, scale, subtract
+from cnpgen.kernels.symbolic.solids import UprightForm, symbolic_solids
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.vertical import Vertical
-from cnpgen.symbolic.kinematics import forward_kinematics
-from cnpgen.symbolic.linalg import Vec, add, dot, scale, subtract
-from cnpgen.symbolic.solids import UprightForm, symbolic_solids
-from cnpgen.symbolic.state import SymbolicState
 
 APART = 0.1  # m: no point on the robot is further than this from its neighbour
 POINT = 1e-12  # m^2: keeps the distance of a point inside a box differentiable

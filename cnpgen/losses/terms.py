@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.dynamics import body_motions, carried
+from cnpgen.kernels.symbolic.linalg import cross, dot
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.problems.constraints.constraint import Condition
-from cnpgen.symbolic.dynamics import body_motions, carried
-from cnpgen.symbolic.linalg import cross, dot
-from cnpgen.symbolic.state import SymbolicState
 
 ROUNDED = 0.05  # m/s^2: below, the centrifugal acceleration counts quadratically, so that its gradient is continuous
 SLOW = 1e-4  # m^2/s^2: keeps the direction of a tip at rest defined

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.stage_planner import SHA256, asked, load_stage_planner
 from cnpgen.pipelines.context import Context
@@ -16,7 +17,6 @@ from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.kinematics import tip_position
 from cnpgen.trajectory.moment import states_at_times
 from cnpgen.trajectory.motion import Motion
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.linalg import Scalar, dot, subtract, symbols
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import sample_tops
 from cnpgen.pipelines.stages.stage import Round, Work
@@ -17,8 +19,6 @@ from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import Scalar, dot, subtract, symbols
-from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 
 from cnpgen.errors import RecipeError, UsageError, lacks
+from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.pipeline import Pipeline
@@ -13,7 +14,6 @@ from cnpgen.pipelines.steps import Step, prepare_steps, steps_of, stored_fields,
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
 from cnpgen.store.field import Field
-from cnpgen.symbolic.kinematics import tip_position
 
 _EITHER = (("start_q", "start_xyz"), ("goal_q", "goal_xyz"))  # joints or a position
 

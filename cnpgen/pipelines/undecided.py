@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.symbolic.linalg import Scalar, symbols
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint, End
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import Scalar, symbols
-from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.symbolic.linalg import Vec, add, dot, solve
 from cnpgen.planner.expressions import equality_residuals
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.linalg import Vec, add, dot, solve
 from cnpgen.trajectory.spline import basis, clamped_knots
 
 if TYPE_CHECKING:

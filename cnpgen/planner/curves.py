@@ -9,10 +9,10 @@ start_q, start_dq, start_ddq, goal_q, goal_dq.
 
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.planner.bending import bend
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import Vec, symbols
 from cnpgen.trajectory.spline import end_derivatives
 
 if TYPE_CHECKING:

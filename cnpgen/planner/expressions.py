@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.symbolic.linalg import Vec, symbols
+from cnpgen.kernels.symbolic.state import SymbolicState, jerk_along
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import Vec, symbols
-from cnpgen.symbolic.state import SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.planner.curves import line_bend
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.kinematics import tip_position
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.plugins import Condition, Constraint, field
-from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.state import World
 
 

@@ -68,7 +68,7 @@ BUILDERS = sorted(filter(makes_functions, MODULES))
 
 def test_the_builders_of_every_room_are_found() -> None:
     assert {name.split(".")[1] for name in BUILDERS} == {
-        *("benchmark", "losses", "pipelines", "planner", "refine", "symbolic"),
+        *("benchmark", "losses", "pipelines", "planner", "refine", "kernels"),
     }
 
 

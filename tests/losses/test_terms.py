@@ -10,18 +10,18 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.kernels.interpreted import InterpretedGridKernel
+from cnpgen.kernels.symbolic.boxes import signed_segment_box_distance
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.state import HeldState, SymbolicState
 from cnpgen.kernels.tape import GridSpec, tape_from_function
 from cnpgen.losses.published import published
 from cnpgen.losses.terms import constraint_term
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.symbolic.boxes import signed_segment_box_distance
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.state import HeldState, SymbolicState
 from tests.examples.losses import huber
 from tests.examples.plans import PROBLEMS, ROBOTS
-from tests.symbolic.test_state import HIGH, LOW, box_bounds, coal_segment_separation, segments
+from tests.kernels.symbolic.test_state import HIGH, LOW, box_bounds, coal_segment_separation, segments
 
 Array = np.ndarray
 

@@ -11,6 +11,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.problems.constraints.axis import Axis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint
@@ -31,8 +33,6 @@ from cnpgen.robots.solid import count_numbers
 from cnpgen.robots.spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.state import SymbolicState
 from cnpgen.world.state import World
 from tests.examples.constraints import TipSpeed as SpeedOfPlugin
 

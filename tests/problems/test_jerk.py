@@ -9,6 +9,8 @@ import pytest
 from scipy.interpolate import BSpline
 
 from cnpgen.errors import RecipeError
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.state import SymbolicState, jerk_along
 from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
 from cnpgen.problems.load import load_problem
@@ -16,8 +18,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import record_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.state import SymbolicState, jerk_along
 from cnpgen.world.state import World
 from tests.examples.jerky import jerky
 from tests.examples.plans import PROBLEMS

@@ -8,15 +8,15 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.segments import segment_distance
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load import load_problem
 from cnpgen.robots.shape.pairs import segment_distances
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.segments import segment_distance
-from cnpgen.symbolic.state import SymbolicState
 from tests.conftest import some
 from tests.examples.shaped_robot import KINDS, write_problem
 from tests.problems.test_constraint_derivatives import differences

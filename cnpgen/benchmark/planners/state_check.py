@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.planners.boxes import APART, DEEP, require_transport
 from cnpgen.kernels.library import choose_backend, problem_kernels
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import Scalar, Vec, dot, symbols
-from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

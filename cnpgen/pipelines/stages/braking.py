@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.solids import symbolic_solids
+from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
@@ -25,9 +28,6 @@ from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Box, Solid, count_numbers, height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.solids import symbolic_solids
-from cnpgen.symbolic.state import SymbolicState
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

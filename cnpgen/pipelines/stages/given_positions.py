@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.kinematics import tip_position
 
 Position = tuple[float, float, float]
 MOST_TASKS = 100_000

@@ -12,9 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    dot,
+    factorize,
+    gram,
+    scale,
+    solve,
+    substitute,
+    subtract,
+    symbols,
+)
 from cnpgen.pipelines.stages.hitting_newton import TOLERANCE, Expansion, expand, safeguard, shortened
 from cnpgen.pipelines.stages.stage import Array
-from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, factorize, gram, scale, solve, substitute, subtract, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

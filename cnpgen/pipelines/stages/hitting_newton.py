@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.symbolic.kinematics import Kinematics, forward_kinematics
-from cnpgen.symbolic.linalg import (
+from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics
+from cnpgen.kernels.symbolic.linalg import (
     Scalar,
     Vec,
     add,

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.errors import UsageError
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.kinematics import forward_kinematics
-from cnpgen.symbolic.linalg import Scalar, Vec, dot, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

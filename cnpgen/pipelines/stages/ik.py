@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cnpgen.errors import RecipeError
+from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import uniform
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.kinematics import Kinematics, forward_kinematics
-from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

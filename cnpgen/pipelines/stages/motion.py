@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.dynamics import inverse_dynamics
-from cnpgen.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Round, Stage, Work
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.symbolic.dynamics import inverse_dynamics
-from cnpgen.symbolic.linalg import symbols
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

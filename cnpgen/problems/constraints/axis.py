@@ -14,7 +14,7 @@ from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from cnpgen.schema.keys import field
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.robots.obstacle import Obstacle
-    from cnpgen.symbolic.state import SymbolicState
     from cnpgen.world.path import PathWorld
     from cnpgen.world.state import World
 
@@ -37,7 +37,7 @@ class RobotClearance(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the signed distance of every moving segment, or capsule's axis, from every obstacle [m]."""
-        from cnpgen.symbolic.solids import symbolic_solids
+        from cnpgen.kernels.symbolic.solids import symbolic_solids
 
         (segments, radii), solids = self._capsules(state), symbolic_solids(state)
         distances = [solid.separation(a, b, state.hold) for a, b in segments for solid in solids]
@@ -45,7 +45,7 @@ class RobotClearance(Constraint):
 
     def penalised(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State distances that are easier to descend: inside, the depth of the middle of what is inside [m]."""
-        from cnpgen.symbolic.solids import symbolic_solids
+        from cnpgen.kernels.symbolic.solids import symbolic_solids
 
         (segments, radii), solids = self._capsules(state), symbolic_solids(state)
         distances = [solid.descent(a, b, state.hold) for a, b in segments for solid in solids]
@@ -101,7 +101,7 @@ class ObjectContact(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the separation of the object from every obstacle [m]."""
-        from cnpgen.symbolic.solids import symbolic_solids
+        from cnpgen.kernels.symbolic.solids import symbolic_solids
 
         kin, size, solids = state.kinematics, state.object_size or (0.0, 0.0, 0.0), symbolic_solids(state)
         distances = [solid.cuboid_separation(kin.tip, kin.rotation, size) for solid in solids]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.world.path import PathWorld
     from cnpgen.world.state import World
 

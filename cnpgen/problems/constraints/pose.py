@@ -13,7 +13,7 @@ from cnpgen.problems.constraints.tip_manifold import Place, TipManifold
 from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
-    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]

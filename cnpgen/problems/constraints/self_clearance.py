@@ -11,9 +11,9 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.pairs import LinkPair
-    from cnpgen.symbolic.state import SymbolicState
     from cnpgen.world.path import PathWorld
     from cnpgen.world.state import World
 
@@ -56,7 +56,7 @@ class SelfClearance(Constraint):
         return self._apart(state, _looked_at(state.robot))
 
     def _apart(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
-        from cnpgen.symbolic.segments import segment_distance
+        from cnpgen.kernels.symbolic.segments import segment_distance
 
         ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
         distances = [segment_distance((a, b), (c, d), hold=state.hold) for (a, b, _), (c, d, _) in ends]

@@ -18,7 +18,7 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import Range
 
 if TYPE_CHECKING:
-    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.state import SymbolicState
     from cnpgen.world.state import World
 
 

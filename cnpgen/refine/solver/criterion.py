@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.state import SymbolicState, jerk_along
 from cnpgen.problems.problem import Problem
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.state import SymbolicState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.state import HeldState, jerk_along
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.state import HeldState, jerk_along
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

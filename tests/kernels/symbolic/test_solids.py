@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.solids import _solid
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import supporting_planes
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.symbolic.linalg import symbols
-from cnpgen.symbolic.solids import _solid
 from tests.conftest import some
 from tests.examples.obstacles import KINDS, ROUNDER, coal_distance, draw_obstacle, segment
 

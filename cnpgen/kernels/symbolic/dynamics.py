@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-from cnpgen.robots.chain import Chain, Joint
-from cnpgen.symbolic.kinematics import joint_rotation
-from cnpgen.symbolic.linalg import (
+from cnpgen.kernels.symbolic.kinematics import joint_rotation
+from cnpgen.kernels.symbolic.linalg import (
     Scalar,
     Vec,
     add,
@@ -17,6 +16,7 @@ from cnpgen.symbolic.linalg import (
     times,
     transposed_times,
 )
+from cnpgen.robots.chain import Chain, Joint
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from cnpgen.symbolic.linalg import Scalar, Vec, cross, dot
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None where the box has no end
 ENDLESS = 100.0  # m: a box without a lower end reaches this far down where one is needed

@@ -11,10 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from cnpgen.robots.shape.hull import supporting_planes
-from cnpgen.robots.shape.inline import corners_of
-from cnpgen.robots.solid import number_slices
-from cnpgen.symbolic.boxes import (
+from cnpgen.kernels.symbolic.boxes import (
     ENDLESS,
     Bounds,
     cuboid_separation,
@@ -23,9 +20,12 @@ from cnpgen.symbolic.boxes import (
     signed_segment_box_distance,
     upright_box_separation,
 )
-from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract
-from cnpgen.symbolic.segments import POINT, segment_distance
-from cnpgen.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract
+from cnpgen.kernels.symbolic.segments import POINT, segment_distance
+from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.robots.shape.hull import supporting_planes
+from cnpgen.robots.shape.inline import corners_of
+from cnpgen.robots.solid import number_slices
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle

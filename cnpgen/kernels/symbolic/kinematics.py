@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.robots.chain import Chain, Joint
-from cnpgen.symbolic.linalg import (
+from cnpgen.kernels.symbolic.linalg import (
     Scalar,
     Vec,
     add,
@@ -23,6 +22,7 @@ from cnpgen.symbolic.linalg import (
     symbols,
     times,
 )
+from cnpgen.robots.chain import Chain, Joint
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.symbolic.dynamics import inverse_dynamics
-from cnpgen.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.symbolic.linalg import Scalar, Vec, add, constants, cross, scale, times
+from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, scale, times
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from cnpgen.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract
 
 POINT = 1e-12  # m^2: the square of the length of a segment that is taken for a point, and what keeps roots smooth
 

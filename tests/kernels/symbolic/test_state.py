@@ -10,16 +10,16 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.kernels.interpreted import InterpretedKernel
+from cnpgen.kernels.symbolic.boxes import segment_box_distance, segment_box_separation, upright_box_separation
+from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.spec import LimitSpec, RobotSpec
-from cnpgen.symbolic.boxes import segment_box_distance, segment_box_separation, upright_box_separation
-from cnpgen.symbolic.dynamics import inverse_dynamics
-from cnpgen.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.symbolic.linalg import symbols
 from tests.conftest import some
 
 STATES = 60
