@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.architecture import Architecture
-from cnpgen.planner.network.features import BLOCKS, Features, count_features
+from cnpgen.planner.network.features import ARRIVAL, BLOCKS, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.record import ProblemRecord
@@ -168,6 +168,8 @@ def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: F
     if found not in [(inputs, outputs, rates) for outputs in interior]:
         expected = f"{(inputs, interior[0], rates)}, or {interior[1]} path outputs where goal accelerations are given"
         raise ValueError(f"the network has {found} inputs, path outputs and rate outputs, expected {expected}")
+    if ARRIVAL in features.blocks and architecture.path_outputs == interior[0]:
+        raise ValueError(f"{ARRIVAL} is among its features, and its outputs leave goal accelerations free")
     for name in ("mean", "scale"):
         shape = getattr(features, name).shape
         if shape != (architecture.inputs,):
