@@ -55,6 +55,7 @@ class Omega:
 
     Attributes:
         problem: The problem.
+        goal_acceleration: Whether accelerations at the goal are "free" or "given".
         path_outputs: Width of phi: interior control points times joints.
         rate_outputs: Width of log_rate: control points of the rate.
 
@@ -82,7 +83,8 @@ class Omega:
             raise UsageError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}")
         if goal_acceleration not in FIXED_AT_GOAL:
             raise UsageError(f"goal_acceleration must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}")
-        self._time, self._fixed = expected_time, FIXED_AT_GOAL[goal_acceleration]
+        self._time, self.goal_acceleration = expected_time, goal_acceleration
+        self._fixed = FIXED_AT_GOAL[goal_acceleration]
         spec = self.problem.trajectory
         self.path_outputs = (spec.path_control_points - 3 - self._fixed) * len(self.problem.robot.joints)
         self.rate_outputs = spec.rate_control_points

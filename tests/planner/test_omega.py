@@ -14,15 +14,10 @@ from cnpgen.planner.omega import Omega
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import needs_compiler
-from tests.examples.models import accelerated
-from tests.examples.plans_of_networks import at_ends, boundary, outputs
+from tests.examples.plans_of_networks import asked_of, at_ends, boundary, outputs
 
 PROBLEMS = ("airhockey", "heavy-object")
 GIVEN = "airhockey, accelerations given"
-
-
-def conditions(problem: str, count: int) -> Boundary:
-    return accelerated(boundary("airhockey", count)) if problem == GIVEN else boundary(problem, count)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +30,8 @@ def omegas(cache_folder: Path, fastest: Any) -> dict[str, Omega]:
 
 @pytest.mark.parametrize("problem", [*PROBLEMS, GIVEN])
 def test_boundary_conditions_hold_whatever_a_network_says(omegas: dict[str, Omega], problem: str) -> None:
-    omega, given = omegas[problem], conditions(problem, 4)
+    omega = omegas[problem]
+    given = asked_of(omega, 4)
     points = omega(omega.tasks(given), *outputs(omega, 4))
     assert points.path.shape == (4, 15, len(omega.problem.robot.joints))
     assert points.rate.shape == (4, 20)
@@ -50,7 +46,7 @@ def test_boundary_conditions_hold_whatever_a_network_says(omegas: dict[str, Omeg
 )
 def test_gradients_of_outputs_are_those_of_central_differences(problem: str, landing: int, omegas: Any) -> None:
     omega = omegas[problem] if landing else Omega(problem, bending_steps=0, landing_steps=0)
-    tasks, given, random = omega.tasks(conditions(problem, 3)), outputs(omega, 3), np.random.default_rng(2)
+    tasks, given, random = omega.tasks(asked_of(omega, 3)), outputs(omega, 3), np.random.default_rng(2)
     points = omega(tasks, *given)
     by_path, by_rate = random.normal(size=points.path.shape), random.normal(size=points.rate.shape)
 
