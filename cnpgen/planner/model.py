@@ -87,7 +87,7 @@ class Model:
     def _weights(self) -> Weights:
         return self.architecture.split(self.parameters)
 
-    @property
+    @cached_property
     def fixed_at_goal(self) -> int:
         """Number of path control points that the goal fixes: 2, or 3 where motions end with a given acceleration."""
         interior = self.architecture.path_outputs // len(self.problem.joint_names)
