@@ -18,6 +18,7 @@ STRICT = {
     "airhockey-onthefly": 0.85,
     "airhockey-replan": 0.85,
     "heavy-object": 0.95,
+    "panda-cup": 0.9,
     "ur5-wipe": 0.9,
 }
 FOLDER = Path(__file__).parents[2] / "datasets" / "models"

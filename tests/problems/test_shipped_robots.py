@@ -14,7 +14,6 @@ from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.dataset import make_dataset
 from cnpgen.pipelines.load import load_pipeline
-from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
@@ -28,8 +27,7 @@ from tests.examples.meshes import Meshes, states
 
 pytestmark = needs_robots
 ROWS, PLANS = 500, 200  # of the long look
-PLANNED = "from the planner"
-WAYS = ("from nothing", PLANNED, "certified")
+WAYS = ("from nothing", "from the planner", "certified")
 
 
 @cache
@@ -48,7 +46,7 @@ def ends_touch(name: str, boundary: Boundary) -> bool:
     return any(meshes_of(name).touches(q) for q in (*boundary.start_q, *boundary.goal_q))
 
 
-@pytest.mark.parametrize("name", [name for name in SHIPPED if name in shipped_models()])
+@pytest.mark.parametrize("name", SHIPPED)
 def test_rows_and_plans_of_the_shipped_planner_touch_nothing(name: str, prepare: Prepare) -> None:
     columns = prepare(load_pipeline(name), "numpy").block(3, "train", 0, stop=20).columns  # compiling takes minutes
     boundary = Boundary.from_batch({name: values.T for name, values in columns.items()}, None)
@@ -84,9 +82,8 @@ def made(name: str, way: str, where: Path) -> Plans:
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize(
-    ("name", "way"), [(name, way) for name in SHIPPED for way in WAYS if way != PLANNED or name in shipped_models()]
-)
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_valid_plans_touch_nothing_and_keep_their_limits(name: str, way: str, tmp_path: Path) -> None:
     plans = made(name, way, tmp_path)
     found = plans[evaluate_plans(plans, workers=1).valid]
