@@ -14,6 +14,7 @@ from typing import Any
 import cnpgen
 
 LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
+NEED_ROBOTS = ("panda-cup", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
 INSTRUCTION_SETS = ("avx512f", "avx2", "avx", "asimd")  # best first
 
 
@@ -59,6 +60,15 @@ def machine_line() -> str:
     versions = ", ".join(f"{name} {value}" for name, value in found["versions"].items())
     head = f"{found['cores']} cores, {found['cpu']}, {found['instructions']}, load {found['load']}"
     return f"machine: {head}; Python {found['python']}, {versions}"
+
+
+def at_hand(names: Iterable[str]) -> list[str]:
+    """Leave out recipes whose robots are not installed, and say so."""
+    chosen = list(names)
+    if _version("example-robot-data") != "not installed":
+        return chosen
+    progress(f"without {', '.join(NEED_ROBOTS)}, which need pip install 'cnpgen[robots]'")
+    return [name for name in chosen if name not in NEED_ROBOTS]
 
 
 def median(values: Iterable[float]) -> float:

@@ -12,19 +12,21 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from common import arguments, median, progress, report, table, verdict
+from common import arguments, at_hand, median, progress, report, table, verdict
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.load import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round, Stage, Work
 
-PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object")
+PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object", "panda-cup", "ur5-wipe")
 BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition
 TARGETS = {  # accepted rows per second and core
     ("airhockey-replan", "compiled"): 120_000,
     ("airhockey-replan", "numpy"): 12_000,
     ("heavy-object", "compiled"): 45_000,
+    ("panda-cup", "compiled"): 20_000,
+    ("ur5-wipe", "compiled"): 20_000,
 }
 
 
@@ -170,7 +172,7 @@ def results(cases: list[Case]) -> dict[str, Any]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--pipeline", nargs="+", default=PIPELINES, help="which pipelines")
+    parser.add_argument("--pipeline", nargs="+", help="which pipelines; by default all whose robots are there")
     parser.add_argument("--backend", nargs="+", default=("compiled", "numpy"), choices=BLOCKS, help="which backends")
     parser.add_argument("--repeat", type=int, default=9, help="repetitions")
     parser.add_argument("--blocks", type=int, help=f"blocks of {BLOCK_ROWS} rows per repetition; default {BLOCKS}")
@@ -178,8 +180,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main() -> None:
     options = arguments(__doc__, add_options)
+    chosen = options.pipeline or at_hand(PIPELINES)
     blocks = {name: options.blocks or number for name, number in BLOCKS.items()}
-    cases = [prepare(pipeline, backend) for pipeline in options.pipeline for backend in options.backend]
+    cases = [prepare(pipeline, backend) for pipeline in chosen for backend in options.backend]
     measure_rates(cases, options.repeat, blocks)
     for case in cases:
         measure_stages(case, 2 * blocks[case.backend])

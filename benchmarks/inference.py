@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from common import arguments, median, progress, report, table, verdict
+from common import arguments, at_hand, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.dataset import make_dataset
@@ -58,7 +58,7 @@ def main() -> None:
     chosen = arguments(__doc__, options)
     found: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
-        cases = {chosen.model: chosen.dataset} if chosen.model else dict.fromkeys(shipped_models())
+        cases = {chosen.model: chosen.dataset} if chosen.model else dict.fromkeys(at_hand(shipped_models()))
         for model, given in cases.items():
             progress(f"planning with {model}")
             folder = given or Path(make_dataset(model, Path(name) / model, n=1200, workers=1).folder)

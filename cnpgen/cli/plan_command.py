@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 _TEXT = """\
 The problems are rows of a dataset, or boundary conditions in an HDF5 file (a shard, a file of plans, or any other):
-start_q and goal_q of shape (N, joints), and start_dq, start_ddq and goal_dq where they are not zero. Plans meet them to
-rounding; whether they meet the constraints 'cnpgen evaluate' says. With --refine they are polished as by 'cnpgen
-refine', and the exit code is 1 if any is not valid in the end; what is finished is in PLANS.part, from where the same
-command goes on. The file of plans is printed on stdout; an existing one is replaced only with --force.
+start_q and goal_q of shape (N, joints), and start_dq, start_ddq and goal_dq where they are not zero; goal_ddq for
+models that hold the goal's acceleration. Plans meet them to rounding; whether they meet the constraints 'cnpgen
+evaluate' says. With --refine they are polished as by 'cnpgen refine', and the exit code is 1 if any is not valid in
+the end; what is finished is in PLANS.part, from where the same command goes on. The file of plans is printed on
+stdout; an existing one is replaced only with --force.
 """
 
 

@@ -78,7 +78,7 @@ class CertifiedPlan(Stage):
 
         def work(draws: Round, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
-            given = None if planner is None else planner.plan_batch(asked(columns)).motion
+            given = None if planner is None else planner.plan_batch(asked(columns, planner)).motion
             with one_thread():
                 motion, valid = solve(columns, given)
             draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)

@@ -99,7 +99,7 @@ class StartOnPlan(Stage):
 
         def make(draws: Round, refined: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Motion]:
             columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
-            motion = planner.plan_batch(asked(columns)).motion
+            motion = planner.plan_batch(asked(columns, planner)).motion
             owner, some = np.arange(len(motion)), np.flatnonzero(refined)
             few = some[::MOMENTS]
             owner[some] = np.repeat(few, MOMENTS)[: len(some)]

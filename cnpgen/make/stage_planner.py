@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.problems.record import record_problem
 from cnpgen.trajectory.boundary import Boundary
 
@@ -60,6 +60,10 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
     return Planner(loaded, backend=context.kernels.backend)
 
 
-def asked(columns: Mapping[str, Array]) -> Boundary:
-    """Return what a planner is asked for N rows with columns of shape (N, width): goal accelerations are free."""
-    return Boundary(*(columns[name] for name in BOUNDARY))
+def asked(columns: Mapping[str, Array], planner: "Planner") -> Boundary:
+    """Return what a planner is asked for N rows with columns of shape (N, width).
+
+    Goal accelerations that it leaves free are left out.
+    """
+    names = BOUNDARY if planner.model.fixed_at_goal == 2 else CONDITIONS
+    return Boundary(**{name: columns[name] for name in names if name in columns})

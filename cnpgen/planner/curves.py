@@ -3,8 +3,8 @@
 The straight line in joint space leaves the manifold by far: a heavy object tilts by some 10 degrees on the way. A
 Gauss-Newton step removes nearly all of that before the network runs, and another one what the network adds. Planning
 takes ``line_bend`` and ``landed_path``, at one plan at a time cheaper than a few operations of NumPy; training takes
-``network.omega``, in float32 and with gradients, and ``path_bend`` behind it. Boundary conditions come as one column:
-start_q, start_dq, start_ddq, goal_q, goal_dq.
+``control_points``, in float32 and with gradients, and ``path_bend`` behind it. Boundary conditions come as one column:
+start_q, start_dq, start_ddq, goal_q, goal_dq, and goal_ddq where the goal fixes three control points instead of two.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -19,80 +19,88 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
     from cnpgen.trajectory.spec import TrajectorySpec
 
-FIXED_AT_GOAL = 2  # control points: goal accelerations are free
 
-
-def line_bend(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+def line_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
     """Build ``(ends, rate, tops) -> change`` of the interior control points on the line, at a constant rate [1/s]."""
     import casadi as ca
 
-    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * robot.n), symbols("tops", count_numbers(problem.obstacle))
-    rate = ca.SX.sym("rate")
-    points = _points(ends, [rate] * problem.trajectory.rate_control_points, problem.trajectory)
-    change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
+    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
+    (tops_sx, tops), rate = symbols("tops", count_numbers(problem.obstacle)), ca.SX.sym("rate")
+    points = _points(_split(ends, robot.n), [rate] * problem.trajectory.rate_control_points, problem.trajectory)
+    change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal)
     return ca.Function("line_bend", [ends_sx, rate, tops_sx], [ca.cse(_column(change))])
 
 
-def landed_path(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
     """Build ``(ends, offsets, rates, tops) -> path``: line plus offsets [rad], bent, with boundary control points."""
     import casadi as ca
 
     spec, n = problem.trajectory, robot.n
-    (ends_sx, ends), (tops_sx, tops) = symbols("ends", 5 * n), symbols("tops", count_numbers(problem.obstacle))
+    (ends_sx, ends), (tops_sx, tops) = (
+        symbols("ends", (3 + fixed_at_goal) * n),
+        symbols("tops", count_numbers(problem.obstacle)),
+    )
     rates_sx, rates = symbols("rates", spec.rate_control_points)
-    offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - FIXED_AT_GOAL) * n)
-    points, interior = _points(ends, rates, spec), slice(3, -FIXED_AT_GOAL)
+    offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - fixed_at_goal) * n)
+    points, interior = _points(_split(ends, n), rates, spec), slice(3, -fixed_at_goal)
     points[interior] = _sums(points[interior], _split(offsets, n))
     if steps:
-        change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
+        change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal)
         points[interior] = _sums(points[interior], change)
     return ca.Function("landed_path", [ends_sx, offsets_sx, rates_sx, tops_sx], [ca.cse(_column(points))])
 
 
-def path_bend(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+def path_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
     """Build ``(path, tops) -> change`` of the interior control points."""
     import casadi as ca
 
-    path, tops, change = _path_bend(robot, problem, steps)
+    path, tops, change = _path_bend(robot, problem, steps, fixed_at_goal)
     return ca.Function("path_bend", [path, tops], [ca.cse(change)])
 
 
-def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int) -> Any:
+def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
     """Build ``(path, tops, seed) -> gradient`` of ``seed . change`` with respect to the path, by the reverse mode."""
     import casadi as ca
 
-    path, tops, change = _path_bend(robot, problem, steps)
+    path, tops, change = _path_bend(robot, problem, steps, fixed_at_goal)
     seed = ca.SX.sym("seed", change.numel())
     gradient = ca.densify(ca.jtimes(change, path, seed, True))
     return ca.Function("path_bend_adjoint", [path, tops, seed], [ca.cse(gradient)])
 
 
-def _path_bend(robot: "Robot", problem: Problem, steps: int) -> tuple[Any, Any, Any]:
+def _path_bend(robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int) -> tuple[Any, Any, Any]:
     points = problem.trajectory.path_control_points
     (path_sx, path), (tops_sx, tops) = (
         symbols("path", points * robot.n),
         symbols("tops", count_numbers(problem.obstacle)),
     )
-    change = bend(robot, problem, _split(path, robot.n), tops, steps=steps, fixed_at_goal=FIXED_AT_GOAL)
+    change = bend(robot, problem, _split(path, robot.n), tops, steps=steps, fixed_at_goal=fixed_at_goal)
     return path_sx, tops_sx, _column(change)
 
 
-def _points(ends: Vec, rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+def _points(ends: list[Vec], rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
     """Control points of the line, boundary ones first and last (paper, Appendix A; ``trajectory.boundary``)."""
-    q, dq, ddq, goal_q, goal_dq = _split(ends, len(ends) // 5)
+    q, dq, ddq, goal_q, goal_dq, *goal_ddq = ends
+    first = _end_points(q, dq, ddq, rates[:2], spec)
+    arrival = [-each for each in goal_dq]  # reversed in phase, r' and p' change sign: the goal is a start with -dq
+    last = _end_points(goal_q, arrival, goal_ddq[0] if goal_ddq else None, rates[:-3:-1], spec)[::-1]
+    count = spec.path_control_points - len(first) - len(last)
+    along = [i / max(count - 1, 1) for i in range(count)]
+    line = [[a + (b - a) * t for a, b in zip(first[-1], last[0], strict=True)] for t in along]
+    return [*first, *line, *last]
+
+
+def _end_points(q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+    """Return the control points that an end fixes, from the outermost one: two where its acceleration is free."""
     path = end_derivatives(spec.path_control_points, spec.degree)
     slope = end_derivatives(spec.rate_control_points, spec.degree).eta * (rates[1] - rates[0])
-    c1, c2, before = [], [], []
-    for x, v, a, goal, arrival in zip(q, dq, ddq, goal_q, goal_dq, strict=True):
-        first = v / rates[0]
-        second = (a - first * slope * rates[0]) / rates[0] ** 2
-        c1.append(x + first / path.eta)
-        c2.append(second / path.beta - 2 * x + 3 * c1[-1])
-        before.append(goal - arrival / rates[-1] / path.eta)
-    count = spec.path_control_points - 3 - FIXED_AT_GOAL
-    along = [i / (count - 1) for i in range(count)]
-    line = [[a + (b - a) * t for a, b in zip(c2, before, strict=True)] for t in along]
-    return [q, c1, c2, *line, before, goal_q]
+    first = [v / rates[0] for v in dq]
+    c1 = [x + v / path.eta for x, v in zip(q, first, strict=True)]
+    if ddq is None:
+        return [q, c1]
+    second = [(a - v * slope * rates[0]) / rates[0] ** 2 for a, v in zip(ddq, first, strict=True)]
+    c2 = [a / path.beta - 2 * x + 3 * c for a, x, c in zip(second, q, c1, strict=True)]
+    return [q, c1, c2]
 
 
 def _split(values: Vec, n: int) -> list[Vec]:

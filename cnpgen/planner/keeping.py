@@ -11,7 +11,7 @@ from cnpgen.trajectory.rest import rest_of, with_finer_knots
 
 Array = NDArray[np.float64]
 
-SAME = 1e-9  # rad and rad/s: a goal that differs by less has not moved
+SAME = 1e-9  # rad, rad/s and rad/s^2: a goal that differs by less has not moved
 OVER = 1e-6  # s: of a motion that ends sooner nothing is kept
 WORTH = 0.98  # of what was left: a new plan must be faster than that; the old one is known, and valid perhaps
 
@@ -41,6 +41,9 @@ def keep_what_is_faster(old: Plans, time: Array, new: Plans, *, acceleration_lim
 
 
 def _same_goal(old: Boundary, new: Boundary) -> NDArray[np.bool_]:
-    pairs = ((old.goal_q, new.goal_q), (old.goal_dq, new.goal_dq))
-    same = [np.abs(one - other).max(axis=1) <= SAME for one, other in pairs]
-    return np.asarray(same[0] & same[1])
+    pairs = [(old.goal_q, new.goal_q), (old.goal_dq, new.goal_dq)]
+    if new.goal_ddq is not None:
+        if old.goal_ddq is None:  # and the old motion's is whatever it came to be
+            return np.zeros(len(old), bool)
+        pairs.append((old.goal_ddq, new.goal_ddq))
+    return np.asarray(np.all([np.abs(one - other).max(axis=1) <= SAME for one, other in pairs], axis=0))

@@ -112,19 +112,27 @@ class Kit:
         )
 
 
-def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool) -> Kit:
+def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at_goal: int = 2) -> Kit:
     """Make the kit of a problem; without equalities there is nothing to bend onto.
 
     Args:
         given: The problem.
         meaning: What the network's outputs stand for.
         slow_down: Whether motions are slowed down; only for those from rest to rest.
+        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
     """
     problem, robot, kernels = given.problem, given.robot, given.kernels
     bent = has_equalities(kernels)
     with kernels.compiling_together():
-        steps, time = meaning.bending_steps if bent else 0, meaning.expected_time
-        prepare = prepare_tasks(problem, robot, kernels, bending_steps=steps, expected_time=time)
-        path = kernels.load(landed_path, steps=meaning.landing_steps if bent else 0)
+        prepare = prepare_tasks(
+            problem,
+            robot,
+            kernels,
+            bending_steps=meaning.bending_steps if bent else 0,
+            expected_time=meaning.expected_time,
+            fixed_at_goal=fixed_at_goal,
+        )
+        landing_steps = meaning.landing_steps if bent else 0
+        path = kernels.load(landed_path, steps=landing_steps, fixed_at_goal=fixed_at_goal)
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
     return Kit(prepare, path, slowing)

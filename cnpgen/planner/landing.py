@@ -5,13 +5,14 @@ eleven phases to second order, and between them as well as the spline can be.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.curves import FIXED_AT_GOAL, path_bend, path_bend_adjoint
+from cnpgen.planner.curves import path_bend, path_bend_adjoint
 from cnpgen.planner.preparation import lanes
 from cnpgen.problems.problem import Problem
 
@@ -61,13 +62,15 @@ class Landing:
         return found
 
 
-def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int) -> Landing:
+def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2) -> Landing:
     """Load the landing of a problem that has equalities.
 
     Args:
         problem: The problem.
         kernels: Where kernels are loaded from.
         steps: Number of Gauss-Newton steps, at least 1.
+        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
     """
-    interior = slice(3, problem.trajectory.path_control_points - FIXED_AT_GOAL)
-    return Landing(kernels.load(path_bend, steps=steps), kernels.load(path_bend_adjoint, steps=steps), interior)
+    interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)
+    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal)
+    return Landing(load(path_bend), load(path_bend_adjoint), interior)

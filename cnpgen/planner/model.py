@@ -1,6 +1,6 @@
 """A trained model: the network's numbers, what its inputs and outputs mean, and where it comes from."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -87,7 +87,19 @@ class Model:
     def _weights(self) -> Weights:
         return self.architecture.split(self.parameters)
 
+    @cached_property
+    def fixed_at_goal(self) -> int:
+        """Number of path control points that the goal fixes: 2, or 3 where motions end with a given acceleration."""
+        interior = self.architecture.path_outputs // len(self.problem.joint_names)
+        return self.problem.trajectory.path_control_points - 3 - interior
+
     @property
     def rests(self) -> bool:
         """Whether all of its motions begin and end at rest, so that they may be slowed down."""
-        return {"start_dq", "start_ddq", "goal_dq"} <= set(self.rest)
+        return begins_and_ends_at_rest(self.rest, self.fixed_at_goal)
+
+
+def begins_and_ends_at_rest(rest: Iterable[str], fixed_at_goal: int) -> bool:
+    """Whether motions may be slowed down of which the named boundary conditions are zero; a free one need not be."""
+    moving = {"start_dq", "start_ddq", "goal_dq"} | ({"goal_ddq"} if fixed_at_goal == 3 else set())
+    return moving <= set(rest)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.architecture import Architecture
-from cnpgen.planner.network.features import BLOCKS, Features, count_features
+from cnpgen.planner.network.features import ARRIVAL, BLOCKS, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.documents import parse_json
@@ -25,7 +25,6 @@ from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
 from cnpgen.store.paths import require_file
 
 KIND, VERSION = "cnpgen-model", 1
-FIXED_POINTS = 5  # of p: three at the start, two at the goal, whose acceleration models leave free
 MOST_STEPS = 20  # of Gauss-Newton, each of which makes a kernel larger
 _FORM = {
     "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
@@ -139,7 +138,7 @@ def _assembled(content: Content) -> Model:
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
     meaning = Meaning(**description["meaning"])
     _check_sizes(problem, architecture, features)
-    if unknown := set(description["rest"]) - set(BOUNDARY):
+    if unknown := set(description["rest"]) - set(CONDITIONS):
         raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
     if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
         raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
@@ -163,14 +162,14 @@ def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: F
     if unknown:
         raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     joints, spec = len(problem.joint_names), problem.trajectory
-    expected = (
-        count_features(features.blocks, joints),
-        (spec.path_control_points - FIXED_POINTS) * joints,
-        spec.rate_control_points,
-    )
+    inputs, rates = count_features(features.blocks, joints), spec.rate_control_points
+    interior = [(spec.path_control_points - 3 - fixed) * joints for fixed in (2, 3)]
     found = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
-    if found != expected:
+    if found not in [(inputs, outputs, rates) for outputs in interior]:
+        expected = f"{(inputs, interior[0], rates)}, or {interior[1]} path outputs where goal accelerations are given"
         raise ValueError(f"the network has {found} inputs, path outputs and rate outputs, expected {expected}")
+    if ARRIVAL in features.blocks and architecture.path_outputs == interior[0]:
+        raise ValueError(f"{ARRIVAL} is among its features, and its outputs leave goal accelerations free")
     for name in ("mean", "scale"):
         shape = getattr(features, name).shape
         if shape != (architecture.inputs,):

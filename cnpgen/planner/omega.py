@@ -16,7 +16,6 @@ from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.planner.curves import FIXED_AT_GOAL
 from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
@@ -33,6 +32,8 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
+FIXED_AT_GOAL = {"free": 2, "given": 3}  # control points, by what is said of the goal's acceleration
+
 
 class Omega:
     """Control points that meet boundary conditions exactly, from what a network says of a task, and gradients back.
@@ -48,11 +49,13 @@ class Omega:
         bending_steps: Gauss-Newton steps that bend the line.
         landing_steps: Gauss-Newton steps that bend the path.
         expected_time: What rates are multiples of the inverse of: "distance" as in the paper, or "reach" (``Meaning``).
+        goal_acceleration: Whether accelerations at the goal are "free", or "given" as those of the rows of panda-cup.
         backend: Which kernels run; by default the fastest that works here.
         cache_folder: Where kernels are kept; by default where all are.
 
     Attributes:
         problem: The problem.
+        goal_acceleration: Whether accelerations at the goal are "free" or "given".
         path_outputs: Width of phi: interior control points times joints.
         rate_outputs: Width of log_rate: control points of the rate.
 
@@ -69,6 +72,7 @@ class Omega:
         bending_steps: int = 1,
         landing_steps: int = 1,
         expected_time: str = "distance",
+        goal_acceleration: str = "free",
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
@@ -77,9 +81,12 @@ class Omega:
         self._landed = integer("landing_steps", landing_steps, least=0)
         if expected_time not in EXPECTED_TIMES:
             raise UsageError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}")
-        self._time = expected_time
+        if goal_acceleration not in FIXED_AT_GOAL:
+            raise UsageError(f"goal_acceleration must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}")
+        self._time, self.goal_acceleration = expected_time, goal_acceleration
+        self._fixed = FIXED_AT_GOAL[goal_acceleration]
         spec = self.problem.trajectory
-        self.path_outputs = (spec.path_control_points - 3 - FIXED_AT_GOAL) * len(self.problem.robot.joints)
+        self.path_outputs = (spec.path_control_points - 3 - self._fixed) * len(self.problem.robot.joints)
         self.rate_outputs = spec.rate_control_points
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
@@ -94,25 +101,34 @@ class Omega:
         robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
         bent = has_equalities(kernels)
         with kernels.compiling_together():
-            steps = self._bending if bent else 0
-            prepare = prepare_tasks(problem, robot, kernels, bending_steps=steps, expected_time=self._time)
-            return prepare, make_landing(problem, kernels, steps=self._landed) if bent and self._landed else None
+            prepare = prepare_tasks(
+                problem,
+                robot,
+                kernels,
+                bending_steps=self._bending if bent else 0,
+                expected_time=self._time,
+                fixed_at_goal=self._fixed,
+            )
+            if not bent or not self._landed:
+                return prepare, None
+            return prepare, make_landing(problem, kernels, steps=self._landed, fixed_at_goal=self._fixed)
 
     @one_thread()
     def tasks(self, boundary: Boundary) -> Tasks:
         """Prepare N tasks: what follows from their boundary conditions before any network runs.
 
         Args:
-            boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU. The acceleration at the
-                goal is free.
+            boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU.
 
         Raises:
-            UsageError: A shape is wrong, something is no real number, or the goal's acceleration is given.
+            UsageError: A shape is wrong, something is no real number, or the goal's acceleration is given where it was
+                said to be free, or the other way round.
         """
-        given = dict(vars(boundary))
-        if given.pop("goal_ddq") is not None:
-            raise UsageError("goal accelerations are left free, so goal_ddq must be None")
-        arrays = {name: numbers(name, values, differentiable=True) for name, values in given.items()}
+        if boundary.fixed_at_goal > self._fixed:
+            raise UsageError('goal accelerations are left free, so goal_ddq must be None; goal_acceleration="given"')
+        if boundary.fixed_at_goal < self._fixed:
+            raise UsageError('goal_ddq is missing: goal_acceleration is "given"')
+        arrays = {name: numbers(name, values, differentiable=True) for name, values in boundary.given().items()}
         shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
         for name, array in arrays.items():
             if array.shape != shape:

@@ -53,10 +53,14 @@ class Planner:
         self._options: dict[str, Any] = {"slow_down": slow_down, "backend": backend}
         with surroundings(self.model.problem, backend) as given:
             self.robot = given.robot
-            self._kit = make_kit(given, self.model.meaning, slow_down=slow_down and self.model.rests)
-            velocity, acceleration = given.robot.velocity_limit, given.robot.acceleration_limit
-            self._still = {"start_dq": AT_REST * velocity, "start_ddq": AT_REST * acceleration}
-            self._still["goal_dq"] = self._still["start_dq"]
+            self._kit = make_kit(
+                given,
+                self.model.meaning,
+                slow_down=slow_down and self.model.rests,
+                fixed_at_goal=self.model.fixed_at_goal,
+            )
+            limits = {"dq": given.robot.velocity_limit, "ddq": given.robot.acceleration_limit}
+            self._still = {f"{end}_{what}": AT_REST * limits[what] for end in ("start", "goal") for what in limits}
         self._completion: Completion | None = None
 
     def __repr__(self) -> str:
@@ -74,6 +78,7 @@ class Planner:
         start_dq: ArrayLike | None = None,
         start_ddq: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
+        goal_ddq: ArrayLike | None = None,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding, whatever the network gives.
 
@@ -87,15 +92,17 @@ class Planner:
             start_dq: Start velocities [rad/s]; at rest by default.
             start_ddq: Start accelerations [rad/s^2]; none by default.
             goal_dq: Goal velocities [rad/s]; at rest by default.
+            goal_ddq: Goal accelerations [rad/s^2], of models that were trained on rows that give them; none by default.
+                Other models leave them free.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
 
         Raises:
-            UsageError: A shape is wrong, something is not finite, or something moves that was at rest in
-                every row that the model was trained on.
+            UsageError: A shape is wrong, something is not finite, something moves that was at rest in every row that
+                the model was trained on, or goal accelerations are given that the model leaves free.
         """
-        return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq))
+        return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq))
 
     @one_thread()
     def plan_batch(
@@ -115,10 +122,8 @@ class Planner:
         Raises:
             UsageError: As for ``plan``.
         """
-        if boundary.goal_ddq is not None:
-            raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
         warn_of_far_joints(self.robot, boundary)
-        return self._kit.plan(self.model, self._rested(boundary), sample_id=sample_id, columns=columns)
+        return self._kit.plan(self.model, self._accepted(boundary), sample_id=sample_id, columns=columns)
 
     @one_thread()
     def strike(
@@ -153,13 +158,21 @@ class Planner:
             self._completion = load_completion(self.model, self._options["backend"])
         tasks = strike_tasks(self._completion, state, puck, towards, meeting=meeting, share=speed_share)
         columns = {name: tasks[name][0] for name in CONTEXT}
-        boundary = self._rested(boundary_of_tasks(tasks))
+        boundary = self._accepted(boundary_of_tasks(tasks, self.model.fixed_at_goal))
         return Strikes(self._kit.plan(self.model, boundary, sample_id=tasks.alive, columns=columns), tasks.why())
 
-    def replan(self, plans: Plans, time: ArrayLike, *, goal_q: ArrayLike, goal_dq: ArrayLike | None = None) -> Plans:
+    def replan(
+        self,
+        plans: Plans,
+        time: ArrayLike,
+        *,
+        goal_q: ArrayLike,
+        goal_dq: ArrayLike | None = None,
+        goal_ddq: ArrayLike | None = None,
+    ) -> Plans:
         """Plan on from points on plans that are being executed: q, dq and ddq go on without a jump.
 
-        At its very end a plan may still accelerate, because goal accelerations are free. What follows a motion that
+        At its very end a plan may still accelerate where goal accelerations are free. What follows a motion that
         ends at rest begins at rest: ``plan`` from its goal.
 
         To a goal that has not moved no plan takes longer than what was left: where the network's is not faster by 2 %,
@@ -172,18 +185,19 @@ class Planner:
                 itself takes time: choose a moment that is still to come.
             goal_q: New goal positions [rad], shape (n,) or (N, n).
             goal_dq: New goal velocities [rad/s]; at rest by default.
+            goal_ddq: New goal accelerations [rad/s^2], as for ``plan``.
 
         Raises:
             UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
         """
         q, dq, ddq = states_at(plans, time)
-        new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq)
+        new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq, goal_ddq=goal_ddq)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         return keep_what_is_faster(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
-    def _rested(self, boundary: Boundary) -> Boundary:
+    def _accepted(self, boundary: Boundary) -> Boundary:
         """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""
-        still = {}
+        boundary, still = self._arriving(boundary), {}
         for name in self.model.rest:
             values = getattr(boundary, name)
             if not np.count_nonzero(values):  # a fifth of the time of any()
@@ -197,6 +211,14 @@ class Planner:
                 )
             still[name] = np.zeros_like(values)
         return replace(boundary, **still) if still else boundary
+
+    def _arriving(self, boundary: Boundary) -> Boundary:
+        """Give the goal an acceleration, of zero where none is said, just where the model holds one."""
+        if boundary.fixed_at_goal == self.model.fixed_at_goal:
+            return boundary
+        if boundary.goal_ddq is not None:
+            raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
+        return replace(boundary, goal_ddq=np.zeros_like(boundary.goal_q))
 
 
 def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:

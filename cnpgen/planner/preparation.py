@@ -33,9 +33,8 @@ def rows(values: Array, n: int) -> Array:
 
 
 def ends_of(boundary: Boundary) -> Array:
-    """Boundary conditions of N motions as ``curves`` takes them, shape (5 n, N)."""
-    parts = (boundary.start_q, boundary.start_dq, boundary.start_ddq, boundary.goal_q, boundary.goal_dq)
-    return np.ascontiguousarray(np.concatenate(parts, axis=1).T)
+    """Boundary conditions of N motions as ``curves`` takes them, shape (5 n, N), or (6 n, N) with goal_ddq."""
+    return np.ascontiguousarray(np.concatenate(list(boundary.given().values()), axis=1).T)
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,13 @@ class Preparation:
 
 
 def prepare_tasks(
-    problem: Problem, robot: "Robot", kernels: KernelLibrary, *, bending_steps: int, expected_time: str = "distance"
+    problem: Problem,
+    robot: "Robot",
+    kernels: KernelLibrary,
+    *,
+    bending_steps: int,
+    expected_time: str = "distance",
+    fixed_at_goal: int = 2,
 ) -> Preparation:
     """Load what tasks are prepared with.
 
@@ -91,7 +96,8 @@ def prepare_tasks(
         kernels: Where kernels are loaded from.
         bending_steps: Gauss-Newton steps that bend the line; 0, as where there are no equalities, leaves it straight.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
+        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
     """
-    line = kernels.load(line_bend, steps=bending_steps) if bending_steps else None
+    line = kernels.load(line_bend, steps=bending_steps, fixed_at_goal=fixed_at_goal) if bending_steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
     return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)

@@ -20,8 +20,8 @@ def read_file(path: Path, model: Model, *, other: bool = False) -> Requests:
 
     Raises:
         UsageError: There is no such file, or it is no shard and its rows were to be other ones.
-        DatasetError: The file is damaged, lacks something, prescribes goal accelerations, is of another problem, or a
-            shard of other rows.
+        DatasetError: The file is damaged, lacks something, prescribes goal accelerations that the model leaves free, is
+            of another problem, or a shard of other rows.
     """
     file = read_boundary_file(path)
     if file.is_shard:

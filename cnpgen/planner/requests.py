@@ -70,9 +70,10 @@ def checked_boundary(where: str, found: Mapping[str, NDArray[Any]], model: Model
     """Take the boundary conditions that a model can plan for out of named columns; what is missing is zero.
 
     Raises:
-        DatasetError: A shape is wrong, something is not finite, or goal accelerations are prescribed.
+        DatasetError: A shape is wrong, something is not finite, or goal accelerations are prescribed that the model
+            leaves free.
     """
-    if "goal_ddq" in found:
+    if "goal_ddq" in found and model.fixed_at_goal == 2:
         raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
     return boundary_in(where, found, len(model.problem.joint_names))
 

@@ -16,7 +16,7 @@ from cnpgen.pipelines.stages.stage import TaskRound
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.model import Model
 from cnpgen.planner.requests import drawing_stages
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.plans import Plans
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -80,9 +80,10 @@ def strike_tasks(
     return completion(dict(zip(GIVEN, columns, strict=True)))
 
 
-def boundary_of_tasks(tasks: TaskRound) -> Boundary:
-    """Return the boundary conditions of the tasks that have an answer."""
-    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in BOUNDARY))
+def boundary_of_tasks(tasks: TaskRound, fixed_at_goal: int) -> Boundary:
+    """Return the boundary conditions of the tasks that have an answer, with goal accelerations where they are fixed."""
+    names = BOUNDARY if fixed_at_goal == 2 else CONDITIONS
+    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
 
 
 def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:

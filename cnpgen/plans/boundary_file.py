@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.plans.format import ATTRIBUTES, BOUNDARY
+from cnpgen.plans.format import ATTRIBUTES, CONDITIONS
 from cnpgen.plans.format import FORMAT as PLANS
 from cnpgen.plans.format import FORMAT_VERSION as PLANS_VERSION
 from cnpgen.plans.load import stored_problem
@@ -23,7 +23,6 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
 
 CONTEXT = ("hit_angle", "hit_speed")  # columns of a dataset that plans keep
-CONDITIONS = (*BOUNDARY, "goal_ddq")
 ASKED = (*CONDITIONS, "sample_id", *CONTEXT)
 SAID = (*ATTRIBUTES, "plan_fingerprint", "recipe_sha256")  # attributes, the last two of shards
 

@@ -8,6 +8,7 @@ FORMAT = "cnpgen-plans"
 FORMAT_VERSION = 1
 
 BOUNDARY = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+CONDITIONS = (*BOUNDARY, "goal_ddq")  # the last one only where goal accelerations are given
 REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
 FLOATS = (*REQUIRED, "goal_ddq", "duration")

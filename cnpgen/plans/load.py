@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
-from cnpgen.plans.format import ATTRIBUTES, BOUNDARY, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
+from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import settle_tips
@@ -184,7 +184,7 @@ def _assembled(
     path: Path, record: ProblemRecord, columns: dict[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> Plans:
     """Put the plans together."""
-    boundary = [columns.pop(name, None) for name in (*BOUNDARY, "goal_ddq")]
+    boundary = [columns.pop(name, None) for name in CONDITIONS]
     points = columns.pop("path_control_points")
     duration = columns.pop("duration", None)  # stored for others; r decides
     plans = make_plans(

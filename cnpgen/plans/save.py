@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.format import BOUNDARY, FORMAT, FORMAT_VERSION, NOTES, plan_fields
+from cnpgen.plans.format import FORMAT, FORMAT_VERSION, NOTES, plan_fields
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files.atomic import write_file
@@ -66,10 +66,7 @@ def check_replaceable(path: Path) -> None:
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
     """Return everything that is stored, in order and in its stored type."""
-    floats = {name: getattr(plans.boundary, name) for name in BOUNDARY}
-    if plans.boundary.goal_ddq is not None:
-        floats["goal_ddq"] = plans.boundary.goal_ddq
-    floats |= dict(sorted(plans.columns.items()))
+    floats = plans.boundary.given() | dict(sorted(plans.columns.items()))
     floats |= {"path_control_points": plans.path_control_points, "rate_control_points": plans.rate_control_points}
     floats["duration"] = plans.duration
     stored: dict[str, NDArray[Any]] = {name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()}

@@ -8,7 +8,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import CONDITIONS
 from cnpgen.training.rows import boundary_columns
 from cnpgen.trajectory.boundary import Boundary
 
@@ -51,7 +51,7 @@ class TrainingData:
 
     @property
     def _names(self) -> list[str]:
-        return [name for name in BOUNDARY if name in self.dataset.fields]
+        return [name for name in CONDITIONS if name in self.dataset.fields]
 
     def demonstrations(self, joints: int) -> ControlPoints | None:
         """Read the plans of a certified dataset's training rows; None if it has none."""

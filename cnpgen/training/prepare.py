@@ -15,6 +15,7 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.model import begins_and_ends_at_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
@@ -49,7 +50,8 @@ def prepare_run(
     """
     boundary = source.training()
     rest, spec = resting(boundary), given.problem.trajectory
-    kit = make_kit(given, settings.meaning, slow_down=len(rest) == 3)  # all of them
+    fixed = boundary.fixed_at_goal
+    kit = make_kit(given, settings.meaning, slow_down=begins_and_ends_at_rest(rest, fixed), fixed_at_goal=fixed)
     rows, features = prepare_rows(boundary, kit.prepare)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
@@ -57,7 +59,7 @@ def prepare_run(
     held_out = source.checked(check_rows)
     architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
     run = Run(
-        learner=Learner(architecture, spec, loss, settings, _landing(given, settings)),
+        learner=Learner(architecture, spec, loss, settings, _landing(given, settings, fixed)),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
@@ -97,10 +99,10 @@ def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Bou
     )
 
 
-def _landing(given: Surroundings, settings: TrainingSettings) -> Landing | None:
+def _landing(given: Surroundings, settings: TrainingSettings, fixed_at_goal: int) -> Landing | None:
     if settings.landing_steps == 0 or not has_equalities(given.kernels):
         return None
-    return make_landing(given.problem, given.kernels, steps=settings.landing_steps)
+    return make_landing(given.problem, given.kernels, steps=settings.landing_steps, fixed_at_goal=fixed_at_goal)
 
 
 def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from cnpgen.loader.order import Order
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.planner.network.features import Features, fit_features
+from cnpgen.planner.network.features import Features, fit_features, usual_blocks
 from cnpgen.planner.preparation import Preparation
 from cnpgen.planner.tasks import Tasks
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[Any]
@@ -44,9 +44,10 @@ class Rows:
 
 
 def boundary_columns(columns: dict[str, Array]) -> Boundary:
-    """Return the boundary conditions among the columns of a dataset; what it lacks is zero."""
+    """Return the boundary conditions among the columns of a dataset; what it lacks is zero, goal accelerations free."""
     zero = np.zeros_like(columns["start_q"], np.float64)
-    return Boundary(*(np.asarray(columns.get(name, zero), np.float64) for name in BOUNDARY))
+    named = {name: columns.get(name, zero) for name in CONDITIONS if name in columns or name in BOUNDARY}
+    return Boundary(**{name: np.asarray(values, np.float64) for name, values in named.items()})
 
 
 def prepare_rows(
@@ -65,14 +66,14 @@ def prepare_rows(
     """
     blocks = [slice(first, first + BLOCK) for first in range(0, max(len(boundary), 1), BLOCK)]
     straight = replace(prepare, line=None)  # features know nothing of the bent line, which is most of the work
-    chosen = features or fit_features(straight(boundary[block]) for block in blocks)
+    chosen = features or fit_features((straight(boundary[block]) for block in blocks), usual_blocks(boundary))
     kept: dict[str, Array] = {}
     for block in blocks:
         for name, values in _arrays(prepare, boundary[block], chosen, dtype).items():
             if name not in kept:
                 kept[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             kept[name][block] = values
-    ends = Boundary(*(kept.pop(name) for name in BOUNDARY))
+    ends = Boundary(**{name: kept.pop(name) for name in boundary.given()})
     rows = Rows(features=kept.pop("features"), tops=kept.pop("tops"), tasks=Tasks(ends, **kept))
     return rows, chosen
 
@@ -80,14 +81,14 @@ def prepare_rows(
 def _arrays(prepare: Preparation, boundary: Boundary, features: Features, dtype: str) -> dict[str, Array]:
     """Prepare a block of rows: everything that has a row per task, by name."""
     tasks = prepare(boundary)
-    found = {name: getattr(boundary, name) for name in BOUNDARY}
+    found = boundary.given()
     found |= {name: values for name, values in vars(tasks).items() if name != "boundary" and values is not None}
     return found | {"features": features.of(tasks, dtype), "tops": prepare.tops(tasks.start_xyz, tasks.goal_xyz)}
 
 
 def resting(boundary: Boundary) -> tuple[str, ...]:
     """Name the boundary conditions that are zero in every row."""
-    return tuple(name for name in BOUNDARY if name.endswith("dq") and not np.any(getattr(boundary, name)))
+    return tuple(name for name, values in boundary.given().items() if name.endswith("dq") and not np.any(values))
 
 
 class StepRows:

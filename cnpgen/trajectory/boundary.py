@@ -83,6 +83,10 @@ class Boundary:
         """Number of path control points that the goal fixes (the paper's N_d)."""
         return 2 if self.goal_ddq is None else 3
 
+    def given(self) -> dict[str, Array]:
+        """Return the boundary conditions that there are: name -> values."""
+        return {name: values for name, values in vars(self).items() if values is not None}
+
     def __len__(self) -> int:
         return len(self.start_q)
 

@@ -3,9 +3,11 @@
 import re
 from pathlib import Path
 
+import coal
 import numpy as np
 import pinocchio as pin
 from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
 
 from cnpgen.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -15,7 +17,7 @@ from tests.examples.obstacles import coal_obstacle
 
 
 class Meshes:
-    """A robot as Pinocchio reads it from its file, among the problem's obstacles, all fixed.
+    """A robot as Pinocchio reads it from its file, and what it holds, among the problem's obstacles, all fixed.
 
     Args:
         problem: The problem, just read from its file.
@@ -31,8 +33,10 @@ class Meshes:
         locked = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
         self.model, (self.geometry,) = pin.buildReducedModel(full, [geometry], locked, pin.neutral(full))
         links = list(self.geometry.geometryObjects)
+        moving = [i for i, each in enumerate(links) if each.parentJoint > 0]
+        moving += [] if problem.object is None else [self._hold(problem)]
         for obstacle in problem.obstacle:
-            self._add(obstacle, [i for i, each in enumerate(links) if each.parentJoint > 0])
+            self._add(obstacle, moving)
         self.with_obstacles = len(self.geometry.collisionPairs)
         names = [self.model.frames[each.parentFrame].name for each in links]
         left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
@@ -43,6 +47,14 @@ class Meshes:
         self.data, self.results = self.model.createData(), self.geometry.createData()
         for request in self.results.distanceRequests:
             request.gjk_tolerance = 1e-9
+
+    def _hold(self, problem: Problem) -> int:
+        """Put the held cuboid about the tip, as the problem's keys say; it may touch what holds it."""
+        frame = self.model.frames[self.model.getFrameId(problem.robot.tip)]
+        turn = Rotation.from_euler("xyz", problem.robot.tip_rotation).as_matrix()  # about fixed axes
+        pose = frame.placement * pin.SE3(turn, np.array(problem.robot.tip_offset))
+        held = pin.GeometryObject("what is held", frame.parentJoint, pose, coal.Box(*problem.object.size))
+        return int(self.geometry.addGeometryObject(held))
 
     def _add(self, obstacle: Obstacle, moving: list[int]) -> None:
         solid, place = coal_obstacle(obstacle)

@@ -45,10 +45,10 @@ def interpreted(given: Surroundings) -> Surroundings:
 
 
 @cache
-def landing_of(name: str) -> Landing:
+def landing_of(name: str, fixed_at_goal: int = 2) -> Landing:
     """The landing of a shipped problem; compiling that of transports takes longer than all tests of it do."""
     given = interpreted(surroundings_of(name)) if name == "heavy-object" else surroundings_of(name)
-    return make_landing(given.problem, given.kernels, steps=1)
+    return make_landing(given.problem, given.kernels, steps=1, fixed_at_goal=fixed_at_goal)
 
 
 def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
@@ -56,20 +56,25 @@ def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
     return Boundary(*(np.asarray(columns[name][:rows], float) for name in names))
 
 
+def accelerated(boundary: Boundary, scale: float = 1.0, seed: int = 9) -> Boundary:
+    """The same, with an acceleration at the goal [rad/s^2]."""
+    return replace(boundary, goal_ddq=scale * np.random.default_rng(seed).normal(size=boundary.goal_q.shape))
+
+
 def architecture_of(given: Surroundings, rows: Rows, settings: TrainingSettings) -> Architecture:
     return Architecture(
         inputs=rows.features.shape[1],
         hidden=settings.hidden,
         layers=settings.layers,
-        path_outputs=10 * given.robot.n,
+        path_outputs=(12 - rows.tasks.boundary.fixed_at_goal) * given.robot.n,
         rate_outputs=20,
     )
 
 
 def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
     """A model of a problem with random parameters: plans are bad, but plans."""
-    given = surroundings_of(name)
-    kit = make_kit(given, meaning_of(0, 0), slow_down=False)  # of which preparing takes nothing else
+    given, fixed = surroundings_of(name), boundary.fixed_at_goal
+    kit = make_kit(given, meaning_of(0, 0), slow_down=False, fixed_at_goal=fixed)  # preparing takes nothing else of it
     rows, features = prepare_rows(boundary, kit.prepare)
     architecture = architecture_of(given, rows, SMALL)
     options = {
@@ -85,12 +90,12 @@ def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: 
 
 def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
     """What one step of training needs, in float32 or float64."""
-    given = surroundings_of(name)
-    kit = make_kit(given, settings.meaning, slow_down=False)
+    given, fixed = surroundings_of(name), boundary.fixed_at_goal
+    kit = make_kit(given, settings.meaning, slow_down=False, fixed_at_goal=fixed)
     rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
     loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
     architecture = architecture_of(given, rows, settings)
-    return Learner(architecture, given.problem.trajectory, loss, settings, landing_of(name)), rows
+    return Learner(architecture, given.problem.trajectory, loss, settings, landing_of(name, fixed)), rows
 
 
 def model_path(folder: Path) -> Path:

@@ -9,6 +9,7 @@ from cnpgen.planner.omega import Omega
 from cnpgen.problems.load import load_problem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import clamped_knots
+from tests.examples.models import accelerated
 
 
 def boundary(problem: str, count: int, seed: int = 0) -> Boundary:
@@ -16,6 +17,12 @@ def boundary(problem: str, count: int, seed: int = 0) -> Boundary:
     base, random = np.array(load_problem(problem).robot.base), np.random.default_rng(seed)
     draw = lambda scale: scale * random.standard_normal((count, len(base)))  # noqa: E731
     return Boundary(base + draw(0.2), draw(0.3), draw(1.0), base + draw(0.2), draw(0.3))
+
+
+def asked_of(omega: Omega, count: int) -> Boundary:
+    """Draw boundary conditions for a block, with accelerations at the goal where they are given."""
+    found = boundary(omega.problem.name, count)
+    return found if omega.goal_acceleration == "free" else accelerated(found)
 
 
 def outputs(omega: Omega, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.examples.loader import ALL, make
-from tests.examples.plans_of_networks import at_ends, boundary, outputs
+from tests.examples.plans_of_networks import asked_of, at_ends, boundary, outputs
 
 jax = pytest.importorskip("jax")
 
@@ -251,6 +251,20 @@ def test_half_precision_is_taken(cache_folder: Path, fastest: Any) -> None:
 @pytest.fixture(scope="module")
 def omega(problem: str, cache_folder: Path, fastest: Any) -> Omega:
     return Omega(problem, backend=fastest, cache_folder=cache_folder)
+
+
+@pytest.fixture(scope="module")
+def arriving(cache_folder: Path, fastest: Any) -> Omega:
+    """One that holds the acceleration at the goal."""
+    return Omega("airhockey", goal_acceleration="given", backend=fastest, cache_folder=cache_folder)
+
+
+def test_jitted_functions_take_tasks_with_an_acceleration_at_the_goal(arriving: Omega) -> None:
+    given = asked_of(arriving, 2)
+    with x64():
+        said = map(jax.numpy.asarray, outputs(arriving, 2))
+        path, rate = jax.jit(lambda tasks, *said: control_points(arriving, tasks, *said))(arriving.tasks(given), *said)
+        np.testing.assert_allclose(at_ends(path, rate)[5], given.goal_ddq, rtol=0, atol=1e-8)
 
 
 def test_control_points_meet_the_boundary_conditions(omega: Omega) -> None:

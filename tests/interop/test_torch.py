@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.examples.loader import ALL, columns, ids, make
-from tests.examples.plans_of_networks import at_ends, boundary, outputs
+from tests.examples.plans_of_networks import asked_of, at_ends, boundary, outputs
 
 torch = pytest.importorskip("torch")
 
@@ -484,17 +484,20 @@ def test_arguments_that_cannot_be_meant_are_named(loss: Any, message: str) -> No
 # Control points.
 
 
-@pytest.fixture(scope="module", params=["airhockey", "heavy-object"])
+@pytest.fixture(
+    scope="module", params=[("airhockey", "free"), ("airhockey", "given"), ("heavy-object", "free")], ids=" ".join
+)
 def omega(request: pytest.FixtureRequest, cache_folder: Path, fastest: Any) -> Omega:
-    return Omega(request.param, backend=fastest, cache_folder=cache_folder)
+    problem, acceleration = request.param
+    return Omega(problem, goal_acceleration=acceleration, backend=fastest, cache_folder=cache_folder)
 
 
 def test_control_points_meet_the_boundary_conditions_and_have_gradients(omega: Omega) -> None:
-    given = boundary(omega.problem.name, 2)
+    given = asked_of(omega, 2)
     tasks = omega.tasks(given)
     said = [torch.tensor(part).requires_grad_() for part in outputs(omega, 2)]
     path, rate = (part.detach() for part in control_points(omega, tasks, *said))
-    wanted = (given.start_q, given.start_dq, given.start_ddq, given.goal_q, given.goal_dq)
+    wanted = given.given().values()
     for found, expected, exact in zip(at_ends(path, rate), wanted, (1e-12, 1e-10, 1e-8) * 2, strict=False):
         np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
     assert torch.autograd.gradcheck(
@@ -504,7 +507,7 @@ def test_control_points_meet_the_boundary_conditions_and_have_gradients(omega: O
 
 
 def test_boundary_conditions_may_be_tensors(omega: Omega) -> None:
-    given = boundary(omega.problem.name, 2)
+    given = asked_of(omega, 2)
     tensors = type(given)(*(None if part is None else torch.tensor(part) for part in vars(given).values()))
     np.testing.assert_array_equal(omega.tasks(tensors).expected_time, omega.tasks(given).expected_time)
     tensors.goal_q.requires_grad_()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.planner.network.features import BLOCKS, fit_features, raw_features
+from cnpgen.planner.network.features import BLOCKS, USUAL, fit_features, raw_features, usual_blocks
 from tests.planner.test_control_points import tasks
 
 
@@ -33,13 +33,22 @@ def test_what_was_constant_in_the_training_rows_is_zero_and_not_nan_for_any_row(
 
 def test_features_are_states_their_sines_tips_and_the_expected_time():
     given = tasks()
-    raw, b = raw_features(given, BLOCKS), given.boundary
+    raw, b = raw_features(given, USUAL), given.boundary
     expected = [
         b.start_q, b.start_dq, b.start_ddq, b.goal_q, b.goal_dq,
         np.sin(b.start_q), np.sin(b.goal_q), np.cos(b.start_q), np.cos(b.goal_q),
         given.start_xyz, given.goal_xyz, np.log(given.expected_time)[:, None],
     ]  # fmt: skip
     np.testing.assert_allclose(raw, np.concatenate(expected, axis=1))
+
+
+def test_the_goals_acceleration_is_a_feature_where_it_is_given():
+    assert usual_blocks(tasks().boundary) == USUAL
+    given = tasks(goal_ddq=True)
+    assert usual_blocks(given.boundary) == BLOCKS
+    raw = raw_features(given, BLOCKS)
+    np.testing.assert_array_equal(raw[:, :-3], raw_features(given, USUAL))
+    np.testing.assert_array_equal(raw[:, -3:], given.boundary.goal_ddq)
 
 
 def test_a_block_that_nobody_knows_is_refused_with_those_that_are_known():

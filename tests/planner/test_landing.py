@@ -7,19 +7,21 @@ from cnpgen.planner.control_points import control_points
 from cnpgen.planner.kit import make_kit
 from cnpgen.planner.landing import make_landing
 from cnpgen.planner.preparation import ends_of, lanes, rows
-from cnpgen.trajectory.boundary import anchor_line, assemble
+from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.conftest import columns_of, needs_compiler, some
-from tests.examples.models import boundary_of_columns, landing_of, meaning_of, surroundings_of
+from tests.examples.models import accelerated, boundary_of_columns, landing_of, meaning_of, surroundings_of
 from tests.planner.test_parts import heights, worst_tilt
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
 
 
-def nearby(tiny, name: str, count: int = 8) -> tuple[np.ndarray, np.ndarray]:
+FIXED = [("airhockey", 2), ("airhockey", 3), ("heavy-object", 2)]  # control points at the goal
+
+
+def nearby(tiny, name: str, count: int = 8, fixed: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Paths near the manifold, as a network gives them, and heights of obstacles."""
-    given = surroundings_of(name)
-    boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), count)
-    kit = make_kit(given, meaning_of(1, 0), slow_down=False)
+    given, boundary = surroundings_of(name), drawn(tiny, name, count, fixed)
+    kit = make_kit(given, meaning_of(1, 0), slow_down=False, fixed_at_goal=fixed)
     tasks, spec = kit.prepare(boundary), given.problem.trajectory
     rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
     interior = anchor_line(boundary, rate, spec) + tasks.correction
@@ -27,9 +29,16 @@ def nearby(tiny, name: str, count: int = 8) -> tuple[np.ndarray, np.ndarray]:
     return assemble(boundary, interior, rate, spec), kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
 
 
-def test_a_plan_near_the_table_is_on_it_behind_the_landing(tiny):
-    path, tops = nearby(tiny, "airhockey")
-    before, after = heights(path), heights(landing_of("airhockey").land(path, tops))
+def drawn(tiny, name: str, count: int, fixed: int) -> Boundary:
+    """Boundary conditions with an acceleration at the goal where it fixes three control points."""
+    boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), count)
+    return boundary if fixed == 2 else accelerated(boundary)
+
+
+@pytest.mark.parametrize("fixed", [2, 3])
+def test_a_plan_near_the_table_is_on_it_behind_the_landing(tiny, fixed):
+    path, tops = nearby(tiny, "airhockey", fixed=fixed)
+    before, after = heights(path), heights(landing_of("airhockey", fixed).land(path, tops))
     assert np.median(before) > 0.01
     assert np.median(after) < 0.05 * np.median(before)
     assert (after < 0.3 * before).all()
@@ -44,20 +53,21 @@ def test_an_object_that_is_nearly_upright_is_so_behind_the_landing(tiny):
     assert np.max(after) < 0.2 * np.median(before)
 
 
-@pytest.mark.parametrize("name", some(DATASETS, 1, "slow"))
-def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, name):
-    path, tops = nearby(tiny, name)
-    given = path.copy()
-    landed = landing_of(name).land(path, tops)
+@pytest.mark.parametrize(("name", "fixed"), some(FIXED, 1, "slow"))
+def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, name, fixed):
+    path, tops = nearby(tiny, name, fixed=fixed)
+    given, ends = path.copy(), [0, 1, 2, *range(15 - fixed, 15)]
+    landed = landing_of(name, fixed).land(path, tops)
     np.testing.assert_array_equal(path, given)
-    np.testing.assert_array_equal(landed[:, [0, 1, 2, 13, 14]], path[:, [0, 1, 2, 13, 14]])
-    assert landing_of(name).land(path.astype(np.float32), tops).dtype == np.float32
+    np.testing.assert_array_equal(landed[:, ends], path[:, ends])
+    assert (landed[:, 3 : 15 - fixed] != path[:, 3 : 15 - fixed]).any(axis=(0, 2)).all()
+    assert landing_of(name, fixed).land(path.astype(np.float32), tops).dtype == np.float32
 
 
-@pytest.mark.parametrize("name", some(DATASETS, 1, "slow"))
-def test_gradients_behind_the_landing_are_taken_back_exactly(tiny, name):
-    path, tops = nearby(tiny, name, 3)
-    landing, random = landing_of(name), np.random.default_rng(1)
+@pytest.mark.parametrize(("name", "fixed"), some(FIXED, 1, "slow"))
+def test_gradients_behind_the_landing_are_taken_back_exactly(tiny, name, fixed):
+    path, tops = nearby(tiny, name, 3, fixed)
+    landing, random = landing_of(name, fixed), np.random.default_rng(1)
     gradient = random.normal(size=path.shape)
     back = landing.pull_back(path, tops, gradient)
     for direction in random.normal(size=(6, *path.shape)):
@@ -88,26 +98,27 @@ def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):
     assert np.isnan(found[2]).any()
 
 
-@pytest.mark.parametrize("name", some(DATASETS, 1, "slow"))
-def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name):
-    given = surroundings_of(name)
-    boundary = boundary_of_columns(columns_of(tiny(DATASETS[name])), 8)
-    kit = make_kit(given, meaning_of(1, 1), slow_down=False)
+@pytest.mark.parametrize(("name", "fixed"), some(FIXED, 1, "slow"))
+def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name, fixed):
+    given, boundary = surroundings_of(name), drawn(tiny, name, 8, fixed)
+    kit = make_kit(given, meaning_of(1, 1), slow_down=False, fixed_at_goal=fixed)
     tasks, random = kit.prepare(boundary), np.random.default_rng(2)
-    phi, log_rate = random.uniform(-1, 1, (8, 10 * given.robot.n)), random.normal(0, 0.3, (8, 20))
+    phi, log_rate = random.uniform(-1, 1, (8, (12 - fixed) * given.robot.n)), random.normal(0, 0.3, (8, 20))
     points = control_points(tasks, phi, log_rate, scale=0.1, spec=given.problem.trajectory)
     tops = kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
-    expected = landing_of(name).land(points.path, tops)
+    expected = landing_of(name, fixed).land(points.path, tops)
     offsets = 0.1 * phi + tasks.correction.reshape(8, -1)
     (found,) = kit.path(ends_of(boundary), lanes(offsets), lanes(points.rate), lanes(tops))
     np.testing.assert_allclose(rows(found, given.robot.n), expected, atol=1e-10)
 
 
-def test_the_bent_line_is_the_papers_line_bent(tiny):
-    given = surroundings_of("heavy-object")
-    boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 5)
-    tasks = make_kit(given, meaning_of(1, 0), slow_down=False).prepare(boundary)
+@pytest.mark.parametrize(("name", "fixed"), FIXED[1:])
+def test_the_bent_line_is_the_papers_line_bent(tiny, name, fixed):
+    given, boundary = surroundings_of(name), drawn(tiny, name, 5, fixed)
+    kit = make_kit(given, meaning_of(1, 0), slow_down=False, fixed_at_goal=fixed)
+    tasks = kit.prepare(boundary)
     rate, spec = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1), given.problem.trajectory
     line = anchor_line(boundary, rate, spec)
-    bent = landing_of("heavy-object").land(assemble(boundary, line, rate, spec), np.zeros((5, 2)))
-    np.testing.assert_allclose(tasks.correction, bent[:, 3:13] - line, atol=1e-12)
+    tops = kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+    bent = landing_of(name, fixed).land(assemble(boundary, line, rate, spec), tops)
+    np.testing.assert_allclose(tasks.correction, bent[:, 3 : 15 - fixed] - line, atol=1e-12)

@@ -13,6 +13,7 @@ from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.planner import model_file
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
+from cnpgen.planner.network.features import STATES
 from cnpgen.store.files.sealed import Content, read_sealed, seal
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
@@ -139,6 +140,9 @@ FORGERIES = {
     "other inputs": (described("architecture", inputs=3), "inputs, path outputs and rate"),
     "a text for a number": (described("architecture", hidden="16"), "hidden must be a whole"),
     "another key": (described("meaning", more=1), "unexpected keyword argument 'more'"),
+    "an acceleration that it leaves free": (
+        described("", features=[*STATES[:4], "goal_ddq", "sin_cos", "tips", "expected_time"]),
+        "its outputs leave goal accelerations free"),
     "no features": (described("", features=[]), "inputs, path outputs and rate outputs"),
     "a layer that is missing": (lambda arrays, texts: arrays.pop("trunk_1_bias"), "it has no 'trunk_1_bias'"),
     "another mean": (lambda arrays, texts: arrays.update(feature_mean=np.zeros(3)), "feature_mean must have shape"),

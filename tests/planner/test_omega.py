@@ -14,35 +14,40 @@ from cnpgen.planner.omega import Omega
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import needs_compiler, some
-from tests.examples.plans_of_networks import at_ends, boundary, outputs
+from tests.examples.plans_of_networks import asked_of, at_ends, boundary, outputs
 
 PROBLEMS = ("airhockey", "heavy-object")
+GIVEN = "airhockey, accelerations given"
 
 
 @pytest.fixture(scope="module")
 def omegas(cache_folder: Path, fastest: Any) -> dict[str, Omega]:
     backends = {"airhockey": fastest, "heavy-object": "numpy"}  # compiling the latter's takes longer than its tests do
-    return {name: Omega(name, backend=backends[name], cache_folder=cache_folder) for name in PROBLEMS}
+    found = {name: Omega(name, backend=backends[name], cache_folder=cache_folder) for name in PROBLEMS}
+    given = Omega("airhockey", goal_acceleration="given", backend=fastest, cache_folder=cache_folder)
+    return found | {GIVEN: given}
 
 
-@pytest.mark.parametrize("problem", some(PROBLEMS, 1, "slow"))
+@pytest.mark.parametrize("problem", [*some(PROBLEMS, 1, "slow"), GIVEN])
 def test_boundary_conditions_hold_whatever_a_network_says(omegas: dict[str, Omega], problem: str) -> None:
-    omega, given = omegas[problem], boundary(problem, 4)
+    omega = omegas[problem]
+    given = asked_of(omega, 4)
     points = omega(omega.tasks(given), *outputs(omega, 4))
     assert points.path.shape == (4, 15, len(omega.problem.robot.joints))
     assert points.rate.shape == (4, 20)
-    wanted = (given.start_q, given.start_dq, given.start_ddq, given.goal_q, given.goal_dq)
     for found, expected, exact in zip(
-        at_ends(points.path, points.rate), wanted, (1e-12, 1e-10, 1e-8) * 2, strict=False
+        at_ends(points.path, points.rate), given.given().values(), (1e-12, 1e-10, 1e-8) * 2, strict=False
     ):
         np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
 
 
-@pytest.mark.parametrize("problem", some(PROBLEMS, 1, "slow"))
-@pytest.mark.parametrize("landing", [0, 1])
+@pytest.mark.parametrize(
+    ("problem", "landing"),
+    [("airhockey", 0), ("airhockey", 1), (GIVEN, 1), *some([("heavy-object", 0), ("heavy-object", 1)], 0, "slow")],
+)
 def test_gradients_of_outputs_are_those_of_central_differences(problem: str, landing: int, omegas: Any) -> None:
     omega = omegas[problem] if landing else Omega(problem, bending_steps=0, landing_steps=0)
-    tasks, given, random = omega.tasks(boundary(problem, 3)), outputs(omega, 3), np.random.default_rng(2)
+    tasks, given, random = omega.tasks(asked_of(omega, 3)), outputs(omega, 3), np.random.default_rng(2)
     points = omega(tasks, *given)
     by_path, by_rate = random.normal(size=points.path.shape), random.normal(size=points.rate.shape)
 
@@ -135,6 +140,10 @@ def test_what_cannot_be_meant_is_refused(omegas: dict[str, Omega]) -> None:
         omega.tasks(replace(given, goal_q=np.zeros((2, 7))))
     with pytest.raises(UsageError, match="goal_ddq must be None"):
         omega.tasks(replace(given, goal_ddq=np.zeros((2, 6))))
+    with pytest.raises(UsageError, match='goal_ddq is missing: goal_acceleration is "given"'):
+        omegas[GIVEN].tasks(given)
+    with pytest.raises(UsageError, match="goal_acceleration must be one of free, given, got 'none'"):
+        Omega("airhockey", goal_acceleration="none")
     with pytest.raises(UsageError, match=r"landing_steps must be an integer from 0 on, got 1\.5"):
         Omega("airhockey", landing_steps=1.5)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="path_scale must be a finite number, got None"):

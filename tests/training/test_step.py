@@ -11,14 +11,15 @@ from cnpgen.training.clipping import Clipping
 from cnpgen.training.rows import Rows
 from cnpgen.training.step import Learner
 from tests.conftest import columns_of
-from tests.examples.models import SMALL, boundary_of_columns, learner_of
+from tests.examples.models import SMALL, accelerated, boundary_of_columns, learner_of
 
 UNCLIPPED = replace(SMALL, sample_clip=np.inf, batch_clip=np.inf)
 NAMES = {"airhockey-replan": "airhockey", "heavy-object": "heavy-object"}
 
 
-def prepared(tiny, dataset: str, count: int = 6) -> tuple[Learner, Rows, np.ndarray]:
+def prepared(tiny, dataset: str, count: int = 6, *, fixed: int = 2) -> tuple[Learner, Rows, np.ndarray]:
     boundary = boundary_of_columns(columns_of(tiny(dataset)), count)
+    boundary = boundary if fixed == 2 else accelerated(boundary)
     learner, rows = learner_of(NAMES[dataset], boundary, dtype="float64", settings=UNCLIPPED)
     parameters = initial_parameters(learner.architecture, seed=0, head_scale=1.0, rate_bias=-0.5)
     return learner, rows, parameters.astype(float)
@@ -50,8 +51,9 @@ def test_the_gradient_of_network_boundary_and_loss_together_is_that_of_finite_di
             assert expected == pytest.approx(found, rel=2e-5, abs=1e-7 * np.linalg.norm(gradient)), names[active]
 
 
-def test_single_parameters_agree_as_well(tiny):
-    learner, rows, parameters = prepared(tiny, "airhockey-replan")
+@pytest.mark.parametrize("fixed", [2, 3])
+def test_single_parameters_agree_as_well(tiny, fixed):
+    learner, rows, parameters = prepared(tiny, "airhockey-replan", fixed=fixed)
     weights, gradient = np.ones(5), np.empty_like(parameters)
     learner.gradient(parameters, rows, weights, shift=0.3, clipping=Clipping(), out=gradient)
     for i in np.random.default_rng(2).integers(0, len(parameters), 20):

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.planner.tasks import Tasks
+from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[Any]
 
 STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-BLOCKS = (*STATES, "sin_cos", "tips", "expected_time")
+USUAL = (*STATES, "sin_cos", "tips", "expected_time")
+ARRIVAL = "goal_ddq"  # where goal accelerations are given
+BLOCKS = (*USUAL, ARRIVAL)
 CONSTANT = 1e-7  # a feature whose standard deviation is below this, in SI units, says nothing
 
 
@@ -36,7 +39,12 @@ class Features:
         return ((raw - self.mean) * self.scale).astype(dtype)
 
 
-def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = BLOCKS) -> Features:
+def usual_blocks(boundary: Boundary) -> tuple[str, ...]:
+    """Return what a network is told of tasks with such boundary conditions."""
+    return USUAL if boundary.goal_ddq is None else BLOCKS
+
+
+def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Features:
     """Measure mean and standard deviation of every feature on the training rows, which come in parts."""
     count, mean, squares = 0, np.zeros(1), np.zeros(1)
     for tasks in parts:
@@ -52,7 +60,7 @@ def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = BLOCKS) -> Fe
 def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     """Compute features in their own units.
 
-    * ``start_q`` to ``goal_dq``: the states [rad, rad/s, rad/s^2];
+    * ``start_q`` to ``goal_dq``, and ``goal_ddq`` where it is given: the states [rad, rad/s, rad/s^2];
     * ``sin_cos``: sines and cosines of start and goal positions, whose products forward kinematics is made of;
     * ``tips``: tip positions at start and goal [m];
     * ``expected_time``: its logarithm.
@@ -69,13 +77,13 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
 
 def count_features(blocks: tuple[str, ...], joints: int) -> int:
     """Return how many features some of ``BLOCKS`` have, for a robot of so many planned joints."""
-    widths = {**dict.fromkeys(STATES, joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
+    widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
     return sum(widths[name] for name in blocks)
 
 
 def _block(tasks: Tasks, name: str) -> Array:
     boundary = tasks.boundary
-    if name in STATES:
+    if name in {*STATES, ARRIVAL}:
         states: Array = getattr(boundary, name)
         return states
     if name == "sin_cos":

@@ -1,0 +1,115 @@
+"""Models that hold the goal's acceleration: trained on rows that give it, asked for it, and what they refuse."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.make.dataset import make_dataset
+from cnpgen.pipelines.stages.motion import TableAcceleration
+from cnpgen.pipelines.stages.stage import TaskRound
+from cnpgen.planner.keeping import keep_what_is_faster
+from cnpgen.planner.model import begins_and_ends_at_rest
+from cnpgen.planner.model_file import load_model
+from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.request_files import read_file
+from cnpgen.planner.requests import read_rows
+from cnpgen.planner.strike import boundary_of_tasks
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.training.train import train_model
+from tests.conftest import columns_of, tiny_recipe
+from tests.examples.models import SMALL, accelerated, boundary_of_columns, untrained_model
+
+Tiny = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Rows with random accelerations on the table at the goal."""
+    recipe, folder = tiny_recipe("airhockey-replan"), tmp_path_factory.mktemp("given") / "rows"
+    stages = (*recipe.pipeline.stage, TableAcceleration(end="goal"))
+    make_dataset(replace(recipe, pipeline=replace(recipe.pipeline, stage=stages)), folder, workers=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def planner(rows: Path, tmp_path_factory: pytest.TempPathFactory) -> Planner:
+    """A planner that was trained on them for a moment."""
+    out = tmp_path_factory.mktemp("models") / "model.h5"
+    train_model(rows, out, steps=10, settings=SMALL, check_rows=1, workers=1)
+    return Planner(load_model(out))
+
+
+def test_plans_end_with_the_acceleration_that_the_rows_give(planner: Planner, rows: Path) -> None:
+    assert planner.model.fixed_at_goal == 3
+    assert planner.model.features.blocks[-1] == "goal_ddq"
+    assert planner.model.rest == ()
+    asked = read_rows(rows, planner.model, n=20).boundary
+    plans = planner.plan_batch(asked)
+    np.testing.assert_array_equal(plans.boundary.goal_ddq, asked.goal_ddq)
+    arrived = states_at(plans, plans.duration)
+    for found, wanted, exact in zip(
+        arrived, (asked.goal_q, asked.goal_dq, asked.goal_ddq), (1e-9, 1e-8, 1e-5), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, atol=exact)
+    for verdict in evaluate_plans(plans, workers=1).verdicts:
+        assert verdict.margins["boundary acceleration"].excess < 1e-9
+
+
+def test_what_is_not_said_is_no_acceleration(planner: Planner, rows: Path, tmp_path: Path) -> None:
+    q = read_rows(rows, planner.model, n=2).boundary
+    np.testing.assert_array_equal(planner.plan(q.start_q, q.goal_q).boundary.goal_ddq, 0)
+    given = planner.plan(q.start_q, q.goal_q, goal_ddq=q.goal_ddq)
+    np.testing.assert_array_equal(given.boundary.goal_ddq, q.goal_ddq)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["start_q"], file["goal_q"], file["goal_ddq"] = q.start_q, q.goal_q, q.goal_ddq
+    np.testing.assert_array_equal(read_file(tmp_path / "a.h5", planner.model).boundary.goal_ddq, q.goal_ddq)
+
+
+def test_a_model_of_motions_at_rest_takes_no_other_acceleration(tiny: Tiny) -> None:
+    boundary = boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
+    still = accelerated(replace(boundary, goal_dq=0 * boundary.goal_dq), 0.0)
+    model = untrained_model("airhockey", still)
+    assert model.rest == ("start_dq", "start_ddq", "goal_dq", "goal_ddq")
+    assert model.rests
+    moving = replace(still, goal_ddq=np.full_like(still.goal_q, 0.1))
+    assert not untrained_model("airhockey", moving).rests
+    with pytest.raises(UsageError, match=r"goal_ddq was zero in every row that the model was trained on, got 0\.1"):
+        Planner(model).plan_batch(moving)
+
+
+def test_motions_with_a_given_acceleration_at_the_goal_are_slowed_down_only_if_it_is_zero() -> None:
+    names = ("start_dq", "start_ddq", "goal_dq")
+    assert begins_and_ends_at_rest(names, 2)
+    assert not begins_and_ends_at_rest(names, 3)
+    assert begins_and_ends_at_rest((*names, "goal_ddq"), 3)
+    assert not begins_and_ends_at_rest(("goal_ddq",), 3)
+
+
+def test_the_rest_of_an_old_plan_is_kept_only_if_it_ends_with_the_acceleration_asked_for(
+    planner: Planner, rows: Path
+) -> None:
+    asked = read_rows(rows, planner.model, n=6).boundary
+    old = planner.plan_batch(asked)
+    when, limit = 0.9 * old.duration, planner.robot.acceleration_limit
+    goal = {"goal_q": asked.goal_q, "goal_dq": asked.goal_dq}
+    same = planner.replan(old, when, **goal, goal_ddq=asked.goal_ddq)
+    np.testing.assert_allclose(same.duration, 0.1 * old.duration)
+    np.testing.assert_allclose(states_at(same, same.duration)[2], asked.goal_ddq, atol=1e-4)
+    other = planner.replan(old, when, **goal, goal_ddq=asked.goal_ddq + 1e-3)
+    assert (other.duration > 0.11 * old.duration).all()
+    free = replace(old, boundary=replace(old.boundary, goal_ddq=None))
+    new = planner.plan_batch(same.boundary)
+    assert keep_what_is_faster(free, when, new, acceleration_limit=limit) is new
+
+
+def test_tasks_of_strikes_bring_the_acceleration_where_a_model_holds_it() -> None:
+    tasks = TaskRound(2)
+    for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq"):
+        tasks[name] = np.full((3, 2), len(name))
+    assert boundary_of_tasks(tasks, 2).goal_ddq is None
+    np.testing.assert_array_equal(boundary_of_tasks(tasks, 3).goal_ddq, 8)
