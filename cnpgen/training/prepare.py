@@ -58,7 +58,7 @@ def prepare_run(
     boundary = source.training()
     rest, spec = resting(boundary), given.problem.trajectory
     kit = make_kit(given, settings.meaning, slow_down=len(rest) == 3)  # all of them
-    rows, features = prepare_rows(boundary, kit.prepare, features=first and first.features)
+    rows, features = prepare_rows(boundary, kit.prepare, features=None if first is None else first.features)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
     loss = _loss(given, settings)
@@ -76,7 +76,7 @@ def prepare_run(
         problem=given.record,
         validate=lambda model: validate(model, kit, held_out),
         rest=rest,
-        first=first and first.parameters,
+        first=None if first is None else first.parameters,
         training={"command": command, **identity(source, settings), "stages": source.dataset.blueprint.stages},
     )
     return run, kit

@@ -103,8 +103,9 @@ def train_model(
             return _finished(job)
         check_beside(job.out)
     with one_thread(), surroundings(as_record(job.source.dataset.problem)) as given:
-        options = {"first": job.first, "check_rows": job.check_rows, "command": command}
-        run, kit = prepare_run(job.source, given, job.settings, **options)
+        run, kit = prepare_run(
+            job.source, given, job.settings, first=job.first, check_rows=job.check_rows, command=command
+        )
         state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
         clock.prepared()
         if begin is not None:
