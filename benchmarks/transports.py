@@ -64,9 +64,8 @@ def on_limits(boundary: Boundary) -> NDArray[np.bool_]:
 
 def to_goals_of_others(count: int, seed: int) -> Boundary:
     """Problems from the start of one row to the goal configuration of the next."""
-    columns = draw_boundary_problems(OLD, SPARE * count, seed=seed).columns
-    goal = {name: np.roll(columns[name], 1, axis=0) for name in ("goal_q", "goal_xyz")}
-    found = complete(OLD, start_q=columns["start_q"], **goal).plans.boundary
+    rows = draw_boundary_problems(OLD, SPARE * count, seed=seed).boundary
+    found = complete(OLD, start_q=rows.start_q, goal_q=np.roll(rows.goal_q, 1, axis=0)).plans.boundary
     near = np.abs(found.goal_q - found.start_q).max(axis=1) <= FARTHEST
     return found[np.flatnonzero(near)[:count]]
 
