@@ -1,0 +1,167 @@
+"""The same steps in compiled code (``step.c``): several times as fast, and equal but for rounding."""
+
+import ctypes
+from ctypes import c_double, c_int, c_long, c_void_p
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.compiled import address_of
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.criterion import ROUNDED
+from cnpgen.refine.solver.grid import Bases
+from cnpgen.refine.solver.quadratic import CHANGES, FEASIBLE, MULTIPLIER, SOFTNESS, USED, Near, Mask, Step
+from cnpgen.refine.solver.transcription import Transcription
+from cnpgen.trajectory.spline import end_derivatives
+
+Array = NDArray[np.float64]
+
+SOURCE = Path(__file__).with_name("step.c")
+BLOCK, TILE = 32, 8  # at least as many as step.c's B and TILE
+
+
+class _Bases(ctypes.Structure):
+    _fields_ = (
+        *((name, c_long) for name in ("orders", "points")),
+        *((name, c_void_p) for name in ("path", "rate", "path_at", "rate_at")),
+    )
+
+
+class _Motion(ctypes.Structure):
+    """``motion`` of step.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in "n path rate fixed nx m gauss criteria thin".split()),
+        ("grid", _Bases),
+        ("nodes", _Bases),
+        *(
+            (name, c_void_p)
+            for name in (
+                "values jacobian criterion start_q start_dq start_ddq goal_q goal_dq goal_ddq top quadrature weights"
+                " criterion_weights smooth lower upper sharp control rates slope w gradient hessian factor rows low high"
+                " norm where active scratch"
+            ).split()
+        ),
+        *((name, c_double) for name in "eta beta rate_eta rounded violation gain left".split()),
+        ("point", c_long * 6),
+        ("variable", c_long * 6),
+        ("slopes", c_long),
+        ("held", c_long),
+    )
+
+
+def load_steps(kernels: KernelLibrary) -> ctypes.CDLL | None:
+    """Return the library of step.c, or None where kernels are not compiled."""
+    library = kernels.load_source(SOURCE)
+    if library is not None:
+        library.look.argtypes, library.look.restype = (c_void_p,) * 3, c_double
+        library.model.argtypes = (*(c_void_p,) * 3, *(c_double,) * 3, *(c_void_p,) * 3)
+        solve = (*(c_void_p,) * 3, c_double, c_double, c_int, c_void_p, c_double, c_double, c_int, c_void_p, c_void_p)
+        library.solve.argtypes = solve
+    return library
+
+
+class CompiledSteps:
+    """What ``PlainSteps`` does.
+
+    Args:
+        motion: The transcription.
+        bounds: Bounds of its residuals.
+        thin: As of ``choose``.
+    """
+
+    def __init__(self, motion: Transcription, bounds: Bounds, thin: int) -> None:
+        library = motion.stage.steps
+        assert library is not None
+        self._look, self._model, self._solve = library.look, library.model, library.solve
+        self._kept: list[Any] = []  # arrays that step.c refers to
+        self._points, self._m, self._nx = len(motion.grid.s), motion.stage.values.tape.outputs[0], motion.nx
+        self._motion = self._describe(motion, bounds, thin)
+        self._at = ctypes.addressof(self._motion)
+
+    def value(self, x: Array) -> tuple[float, Array, float]:
+        """Evaluate what is minimised, residuals (K, m) and their worst violation."""
+        g = np.empty((self._m, self._points))
+        cost = self._look(self._at, address_of(x), address_of(g))
+        return cost, g.T, self._motion.violation
+
+    def model(self, x: Array, g: Array, near: Near, *, proximal: float, penalty: float) -> "CompiledModel":
+        """Lay out the quadratic model near x, where residuals are g."""
+        held, missed = np.empty((self._m, self._points), bool), np.ascontiguousarray(near.missed.T)
+        before = None if near.multipliers is None else np.ascontiguousarray(near.multipliers.T)
+        addresses = address_of(missed), None if before is None else address_of(before), address_of(held)
+        self._motion.violation = near.violation
+        convex = self._model(self._at, address_of(x), address_of(g.T), proximal, near.near, near.leap, *addresses)
+        return CompiledModel(self, g, held.T, penalty * near.violation + USED, bool(convex))
+
+    def solve(
+        self, model: "CompiledModel", box: Array, *, warm: Array | None = None, relax: bool = False
+    ) -> Step | None:
+        """Solve the programme of the model that was laid out last."""
+        dx, multipliers = np.empty(self._nx), np.zeros((self._m, self._points))
+        before = None if warm is None else np.ascontiguousarray(warm.T)
+        numbers = None if before is None else address_of(before), MULTIPLIER, FEASIBLE, CHANGES
+        arrays, results = (address_of(model.g.T), address_of(box)), (address_of(dx), address_of(multipliers))
+        if not self._solve(self._at, *arrays, model.slope, SOFTNESS, relax, *numbers, *results):
+            return None
+        found = self._motion
+        return Step(dx, found.left, multipliers.T, found.gain) if np.isfinite(dx).all() else None
+
+    def _describe(self, motion: Transcription, bounds: Bounds, thin: int) -> _Motion:
+        stage, grid, spec, b = motion.stage, motion.grid, motion.spec, motion.boundary
+        n, nx, m, points = motion.n, motion.nx, self._m, self._points
+        width, rows = stage.values.tape.inputs[0], nx + 1 + m * points + BLOCK
+        path = end_derivatives(spec.path_control_points, spec.degree)
+        rate = end_derivatives(spec.rate_control_points, spec.degree)
+        criterion, nodes, count = stage.criterion, len(grid.criterion_weights), 0
+        rounded = ROUNDED if criterion is not None and criterion.kind == "centrifugal" else 0.0
+        if stage.residuals is not None:
+            count = stage.residuals.tape.outputs[0]
+        stride = nx + BLOCK
+        scratch = m * points + (width + 1) * m * TILE + nodes * (4 * n + 3) * (count + 1) + nodes * count
+        said = {
+            "start_q": b.start_q, "start_dq": b.start_dq, "start_ddq": b.start_ddq, "goal_q": b.goal_q,
+            "goal_dq": b.goal_dq, "goal_ddq": b.goal_ddq, "top": motion.tops_along, "quadrature": grid.gauss,
+            "weights": grid.weights, "smooth": motion.smooth, "lower": bounds.lower.T, "upper": bounds.upper.T,
+            "sharp": bounds.sharp.T,
+            "criterion_weights": (0.0 if criterion is None else criterion.weight) * grid.criterion_weights,
+        }  # fmt: skip
+        sizes = {
+            "control": spec.path_control_points * n, "rates": spec.rate_control_points, "slope": 6 * n,
+            "w": width * points, "gradient": nx, "hessian": nx**2, "factor": nx**2, "rows": rows * (nx + 1),
+            "low": rows, "high": rows, "norm": rows, "where": m * points, "active": nx + 1,
+            "scratch": scratch + (2 * stride + 10) * stride,
+        }  # fmt: skip
+        arrays = {name: None if array is None else self._keep(array) for name, array in said.items()}
+        arrays |= {name: self._keep(np.empty(size)) for name, size in sizes.items()}
+        return _Motion(
+            n=n, path=spec.path_control_points, rate=spec.rate_control_points, fixed=3 + motion.interior, nx=nx, m=m,
+            gauss=len(grid.weights), criteria=count, thin=thin, grid=self._bases(grid.bases),
+            nodes=self._bases(grid.criterion), values=stage.values.address, jacobian=stage.jacobian.address,
+            criterion=None if stage.residuals is None else stage.residuals.address,
+            eta=path.eta, beta=path.beta, rate_eta=rate.eta, rounded=rounded, **arrays,
+        )  # fmt: skip
+
+    def _bases(self, bases: Bases) -> _Bases:
+        orders, points, _ = bases.path.shape
+        arrays = (*bases.along, bases.path_at, bases.rate_at)
+        return _Bases(orders, points, *map(self._keep, arrays))
+
+    def _keep(self, array: Array) -> int:
+        array = np.ascontiguousarray(array)
+        self._kept.append(array)
+        return address_of(array)
+
+
+class CompiledModel:
+    """What ``QuadraticModel`` is."""
+
+    def __init__(self, steps: CompiledSteps, g: Array, held: Mask, slope: float, convex: bool) -> None:
+        self._steps, self.g, self.held, self.slope, self._convex = steps, g, held, slope, convex
+
+    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
+        """Return the best step within the box, or None where there is none; see ``QuadraticModel.solve``."""
+        return self._steps.solve(self, box, warm=warm, relax=relax) if self._convex else None

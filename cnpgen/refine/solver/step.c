@@ -1,0 +1,461 @@
+/* One step of the sequential quadratic programme of one motion: what transcription.py and quadratic.py say in NumPy, over
+the same compiled kernels, and the nearest point of a polyhedron in the place of DAQP.
+
+Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n joints,
+nx variables; w = (p, p', ..., r, r', ...) of `width` components. vectors.h comes first. */
+
+#define B (4 * W) /* rows of the quadratic programme that are laid out side by side */
+#define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
+#define EACH(i, from, to) for (long i = (from); i < (to); i++)
+
+typedef void kernel(long, const double *const *, const long *, double *const *);
+
+typedef struct { /* a spline basis at some phases */
+  long orders, points;
+  const double *path, *rate;       /* (orders, C, points), (orders - 1, R, points) */
+  const double *path_at, *rate_at; /* (points, C, orders), (points, R, orders - 1) */
+} bases;
+
+typedef struct {
+  long n, path, rate, fixed, nx, m, gauss, criteria, thin;
+  bases grid, nodes;
+  kernel *values, *jacobian, *criterion;
+  const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be missing */
+  const double *top;                    /* (numbers, K) */
+  const double *quadrature, *weights;   /* basis of r at the nodes of the time integral (gauss, R), their weights */
+  const double *criterion_weights;      /* (nodes.points,), times the criterion's weight */
+  const double *smooth;                 /* (R, R) */
+  const double *lower, *upper;          /* (m, K) */
+  const unsigned char *sharp;           /* (m, K) */
+  double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, n), (width, K) */
+  double *gradient, *hessian, *factor;  /* (nx,), (nx, nx) each */
+  double *rows, *low, *high, *norm;     /* blocks of B rows, (nx + 1, B) each; of every row */
+  int *where, *active;                  /* residual i at point k of row nx + 1 + ... is number i K + k */
+  double *scratch;
+  double eta, beta, rate_eta, rounded, violation, gain, left;
+  long point[6], variable[6], slopes, held;
+} motion;
+
+I double sum(v x) { double s = 0; EACH(i, 0, W) s += x[i]; return s; }
+I v at(const double *p) { return *(const vu *)p; }
+I void put(double *p, v x) { *(vu *)p = x; }
+I long padded(long n) { return (n + W - 1) / W * W; }
+
+static double dot(const double *a, const double *b, long n) {
+  v s = K(0);
+  double rest = 0;
+  long i = 0;
+  for (; i + W <= n; i += W) s += at(a + i) * at(b + i);
+  for (; i < n; i++) rest += a[i] * b[i];
+  return sum(s) + rest;
+}
+
+static void add(double *restrict a, double f, const double *restrict b, long n) {
+  long i = 0;
+  for (; i + W <= n; i += W) put(a + i, at(a + i) + K(f) * at(b + i));
+  for (; i < n; i++) a[i] += f * b[i];
+}
+
+/* ---- The motion of variables x: control points, states, objective (Transcription) ---- */
+
+/* The two control points beside an end, from its state, and how they move with the rate (trajectory/boundary, slopes). */
+static void end(motion *s, const double *q, const double *dq, const double *ddq, double sign, long last, long step) {
+  long inner = last + step, edge = step > 0 ? 0 : s->path - 1;
+  double r = s->rates[last], eta = s->eta;
+  double rise = ddq ? s->rate_eta * (s->rates[inner] - r) : 0;
+  double *c = s->control + edge * s->n, *c1 = c + step * s->n, *c2 = c1 + step * s->n, *d = s->slope + s->slopes * s->n;
+  EACH(j, 0, s->n) {
+    double v0 = sign * dq[j], first = v0 / r, d1 = -v0 / (r * r * eta);
+    c[j] = q[j];
+    c1[j] = q[j] + first / eta;
+    d[j] = d1;
+    if (ddq) {
+      c2[j] = (ddq[j] - first * rise * r) / (r * r) / s->beta - 2 * q[j] + 3 * c1[j];
+      d[s->n + j] = (-2 * (ddq[j] - v0 * rise) / r + v0 * s->rate_eta) / (r * r) / s->beta + 3 * d1;
+      d[2 * s->n + j] = -v0 * s->rate_eta / (r * r * s->beta);
+    }
+  }
+  EACH(i, 0, ddq ? 3 : 1) {
+    s->point[s->slopes] = edge + (i ? 2 : 1) * step;
+    s->variable[s->slopes++] = i == 2 ? inner : last;
+  }
+}
+
+static void unpack(motion *s, const double *x) {
+  long split = s->nx - s->rate;
+  EACH(i, 0, s->rate) s->rates[i] = exp(x[split + i]);
+  memcpy(s->control + 3 * s->n, x, split * sizeof(double));
+  s->slopes = 0;
+  end(s, s->start_q, s->start_dq, s->start_ddq, 1, 0, 1);
+  end(s, s->goal_q, s->goal_dq, s->goal_ddq, -1, s->rate - 1, -1);
+}
+
+static void states(const motion *s, const bases *b, double *w) {
+  long n = s->n, points = b->points;
+  memset(w, 0, (b->orders * n + b->orders - 1) * points * sizeof(double));
+  EACH(o, 0, b->orders) EACH(c, 0, s->path) EACH(j, 0, n)
+    add(w + (o * n + j) * points, s->control[c * n + j], b->path + (o * s->path + c) * points, points);
+  EACH(o, 0, b->orders - 1) EACH(c, 0, s->rate)
+    add(w + (b->orders * n + o) * points, s->rates[c], b->rate + (o * s->rate + c) * points, points);
+}
+
+/* Gradient in the variables of a function whose gradient in w, at one phase, is J. */
+static void chain(const motion *s, const bases *b, long k, const double *J, double *row) {
+  long n = s->n, orders = b->orders, split = s->nx - s->rate;
+  const double *path = b->path_at + k * s->path * orders, *rate = b->rate_at + k * s->rate * (orders - 1);
+  EACH(i, 0, s->rate) row[split + i] = dot(rate + i * (orders - 1), J + orders * n, orders - 1) * s->rates[i];
+  EACH(c, 0, s->path) {
+    double control[n];
+    EACH(j, 0, n) control[j] = 0;
+    EACH(o, 0, orders) EACH(j, 0, n) control[j] += path[c * orders + o] * J[o * n + j];
+    if (c >= 3 && c < s->fixed) EACH(j, 0, n) row[(c - 3) * n + j] = control[j];
+    EACH(e, 0, s->slopes) if (s->point[e] == c)
+      row[split + s->variable[e]] += dot(control, s->slope + e * n, n) * s->rates[s->variable[e]];
+  }
+}
+
+/* The criterion's integral; its gradient and Gauss-Newton Hessian are added where they are wanted. */
+static double criterion(motion *s, int derivatives) {
+  const bases *b = &s->nodes;
+  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points, nx = s->nx;
+  double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points, *row = jacobian + width * count * points;
+  double J[width], cost = 0;
+  states(s, b, w);
+  s->criterion(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
+  EACH(k, 0, points) {
+    double squares = 0, r = w[b->orders * n * points + k], share = s->criterion_weights[k] / r;
+    EACH(i, 0, count) squares += e[i * points + k] * e[i * points + k];
+    double size = sqrt(squares + s->rounded * s->rounded);
+    double rho = s->rounded > 0 ? size - s->rounded : squares, slope = s->rounded > 0 ? 1 / size : 2;
+    cost += share * rho;
+    if (!derivatives) continue;
+    EACH(i, 0, s->rate)
+      s->gradient[nx - s->rate + i] -= share * rho / r * b->rate_at[(k * s->rate + i) * (b->orders - 1)] * s->rates[i];
+    EACH(i, 0, count) {
+      EACH(j, 0, width) J[j] = jacobian[(j * count + i) * points + k];
+      chain(s, b, k, J, row);
+      add(s->gradient, share * slope * e[i * points + k], row, nx);
+      EACH(j, 0, nx) add(s->hessian + j * nx, share * slope * row[j], row, j + 1);
+    }
+  }
+  return cost;
+}
+
+/* The time and what fixes the gauge; their gradient and curvature are set where they are wanted. */
+static double duration(motion *s, const double *log, int derivatives) {
+  long nx = s->nx, split = nx - s->rate;
+  double cost = 0;
+  EACH(i, 0, s->rate) {
+    double pull = dot(s->smooth + i * s->rate, log, s->rate);
+    cost += 0.5 * log[i] * pull;
+    if (!derivatives) continue;
+    s->gradient[split + i] = pull;
+    memcpy(s->hessian + (split + i) * nx + split, s->smooth + i * s->rate, s->rate * sizeof(double));
+  }
+  EACH(q, 0, s->gauss) {
+    const double *basis = s->quadrature + q * s->rate;
+    double slope[s->rate], inverse = 1 / dot(basis, s->rates, s->rate), weight = s->weights[q] * inverse;
+    cost += weight;
+    if (!derivatives) continue;
+    EACH(i, 0, s->rate) slope[i] = basis[i] * s->rates[i];
+    add(s->gradient + split, -weight * inverse, slope, s->rate);
+    EACH(i, 0, s->rate) if (slope[i] != 0)
+      add(s->hessian + (split + i) * nx + split, 2 * weight * inverse * inverse * slope[i], slope, i + 1);
+  }
+  return cost;
+}
+
+static double worst(motion *s, const double *g) {
+  double found = 0;
+  EACH(i, 0, s->m * s->grid.points) {
+    double excess = g[i] - s->upper[i] > s->lower[i] - g[i] ? g[i] - s->upper[i] : s->lower[i] - g[i];
+    if (!(excess <= found)) found = excess;
+    if (found != found) return INFINITY;
+  }
+  return found;
+}
+
+/* Residuals (m, K) and the objective of variables x; the worst violation is left in `violation`. */
+double look(motion *s, const double *x, double *g) {
+  unpack(s, x);
+  states(s, &s->grid, s->w);
+  long points = s->grid.points, ld[2] = {points, points};
+  s->values(points, (const double *const[]){s->w, s->top}, ld, (double *const[]){g});
+  s->violation = worst(s, g);
+  return duration(s, x + s->nx - s->rate, 0) + (s->criterion ? criterion(s, 0) : 0);
+}
+
+/* ---- The quadratic model there (choose and QuadraticModel) ---- */
+
+/* Factor the Hessian with the proximal term; what it is multiplied by to turn rows into variables where it is 1. */
+static int factor(motion *s, double proximal) {
+  long nx = s->nx;
+  EACH(i, 0, nx) {
+    double *row = s->factor + i * nx;
+    EACH(j, 0, i) {
+      const double *other = s->factor + j * nx;
+      row[j] = (s->hessian[i * nx + j] - dot(row, other, j)) * other[j];
+    }
+    double pivot = s->hessian[i * nx + i] + proximal - dot(row, row, i);
+    if (!(pivot > 0)) return 0;
+    row[i] = 1 / sqrt(pivot);
+  }
+  return 1;
+}
+
+/* Divide B rows side by side, (nx, B), by the factor. */
+static void whiten(const motion *s, double *block) {
+  EACH(i, 0, s->nx) {
+    const double *row = s->factor + i * s->nx;
+    v x[4];
+    EACH(l, 0, 4) x[l] = at(block + i * B + l * W);
+    EACH(j, 0, i) EACH(l, 0, 4) x[l] -= K(row[j]) * at(block + j * B + l * W);
+    EACH(l, 0, 4) put(block + i * B + l * W, K(row[i]) * x[l]);
+  }
+}
+
+I double *entry(const motion *s, long row, long i) { return s->rows + (row / B) * (s->nx + 1) * B + i * B + row % B; }
+
+/* How far outside residual i is at point k, and whether it is a crest along the motion, beside one, or in the thin grid. */
+I double outside(const motion *s, const double *g, long at) {
+  return g[at] - s->upper[at] > s->lower[at] - g[at] ? g[at] - s->upper[at] : s->lower[at] - g[at];
+}
+static void crest(const motion *s, const double *excess, unsigned char *wide) {
+  long last = s->grid.points - 1;
+  EACH(k, 0, last + 1) wide[k] = k % s->thin == 0;
+  EACH(k, 0, last + 1) if ((k == 0 || excess[k] >= excess[k - 1]) && (k == last || excess[k] >= excess[k + 1]))
+    EACH(near, k > 0 ? k - 1 : 0, k < last ? k + 2 : k + 1) wide[near] = 1;
+}
+
+static double leap(const motion *s, long k, const double *J, double step) {
+  const bases *b = &s->grid;
+  double reach = 0;
+  EACH(o, 1, b->orders - 1) {
+    double change = 0;
+    EACH(i, 0, s->rate) change += fabs(b->rate_at[(k * s->rate + i) * (b->orders - 1) + o]) * s->rates[i];
+    reach += fabs(J[b->orders * s->n + o]) * change * step;
+  }
+  return reach;
+}
+
+/* Lay out the model at x, whose residuals are g: residuals are held that are nearer to a bound than `near`, that may leap
+over it with a step of `step`, that were `missed`, or that had multipliers. `held` says which. 0: the Hessian is not positive. */
+int model(motion *s, const double *x, const double *g, double proximal, double near, double step,
+          const unsigned char *missed, const double *multipliers, unsigned char *held) {
+  long nx = s->nx, n = s->n, points = s->grid.points, width = s->grid.orders * n + s->grid.orders - 1, m = s->m;
+  unpack(s, x);
+  states(s, &s->grid, s->w);
+  memset(s->gradient, 0, nx * sizeof(double));
+  memset(s->hessian, 0, nx * nx * sizeof(double));
+  duration(s, x + nx - s->rate, 1);
+  if (s->criterion) criterion(s, 1);
+  if (!factor(s, proximal)) return 0;
+
+  double *excess = s->scratch, *values = excess + m * points, *jacobian = values + m * TILE, *row = jacobian + width * m * TILE;
+  double J[width];
+  EACH(i, 0, m * points) excess[i] = outside(s, g, i);
+  EACH(i, 0, m) crest(s, excess + i * points, held + i * points);
+  EACH(i, 0, m * points)
+    held[i] = (held[i] && excess[i] > -near) || missed[i] || (multipliers && multipliers[i] != 0);
+
+  long count = nx + 1;
+  memset(s->rows, 0, (count + B) / B * (nx + 1) * B * sizeof(double));
+  EACH(i, 0, nx) *entry(s, i, i) = 1;
+  for (long first = 0; first < points; first += TILE) {
+    long tile = points - first < TILE ? points - first : TILE, ld[2] = {points, points};
+    s->jacobian(tile, (const double *const[]){s->w + first, s->top + first}, ld, (double *const[]){values, jacobian});
+    EACH(t, 0, tile) EACH(i, 0, m) {
+      long k = first + t, number = i * points + k;
+      if (!held[number] && !s->sharp[number]) continue;
+      EACH(j, 0, width) J[j] = jacobian[(j * m + i) * tile + t];
+      if (!held[number] && !(excess[number] > -leap(s, k, J, step))) continue;
+      held[number] = 1;
+      s->where[count - nx - 1] = number;
+      chain(s, &s->grid, k, J, row);
+      if (count % B == 0) memset(entry(s, count, 0), 0, (nx + 1) * B * sizeof(double));
+      EACH(j, 0, nx) *entry(s, count, j) = row[j];
+      count++;
+    }
+  }
+  for (long first = 0; first < count; first += B) whiten(s, entry(s, first, 0));
+  s->held = count - nx - 1;
+  return 1;
+}
+
+/* ---- Its solution: the point of a polyhedron that is nearest to -f (Goldfarb and Idnani, Math. Programming 27, 1983) ---- */
+
+#define PARALLEL 1e-11 /* of its square: what is left of a row that depends on active ones */
+
+typedef struct { /* active rows a, with signs so that a x <= b, and the factor of their products, whose diagonal is inverted */
+  long dim, stride, count;
+  double *a, *factor, *b, *sign, *multiplier, *product, *share;
+  int *row;
+} working;
+
+/* Solve factor x = y, or with the transposed one, in place. */
+static void forward(const working *s, double *y) {
+  EACH(i, 0, s->count) y[i] = (y[i] - dot(s->factor + i * s->stride, y, i)) * s->factor[i * s->stride + i];
+}
+static void backward(const working *s, double *y) {
+  for (long i = s->count - 1; i >= 0; i--) {
+    y[i] *= s->factor[i * s->stride + i];
+    add(y, -y[i], s->factor + i * s->stride, i);
+  }
+}
+
+/* Put a row that would come next into the basis of the active ones: its square without them is returned, `share` are its
+coefficients in them. */
+static double project(working *s, const double *a) {
+  EACH(i, 0, s->count) s->product[i] = dot(s->a + i * s->stride, a, s->dim);
+  forward(s, s->product);
+  memcpy(s->share, s->product, s->count * sizeof(double));
+  backward(s, s->share);
+  return dot(a, a, s->dim) - dot(s->product, s->product, s->count);
+}
+
+static void activate(working *s, const double *a, double b, double sign, double multiplier, long row, double square) {
+  long k = s->count++;
+  memmove(s->a + k * s->stride, a, s->dim * sizeof(double));
+  memcpy(s->factor + k * s->stride, s->product, k * sizeof(double));
+  s->factor[k * s->stride + k] = 1 / sqrt(square);
+  s->b[k] = b, s->sign[k] = sign, s->multiplier[k] = multiplier, s->row[k] = (int)row;
+}
+
+static void release(working *s, long k) {
+  long stride = s->stride;
+  s->count--;
+  EACH(i, k, s->count) { /* rows move up; rotations of neighbouring columns make the factor triangular again */
+    memcpy(s->a + i * stride, s->a + (i + 1) * stride, s->dim * sizeof(double));
+    memcpy(s->factor + i * stride, s->factor + (i + 1) * stride, (i + 2) * sizeof(double));
+    s->b[i] = s->b[i + 1], s->sign[i] = s->sign[i + 1], s->multiplier[i] = s->multiplier[i + 1], s->row[i] = s->row[i + 1];
+  }
+  EACH(i, k, s->count) {
+    double *f = s->factor + i * stride, last = 1 / f[i + 1], size = sqrt(f[i] * f[i] + last * last);
+    double c = f[i] / size, d = last / size;
+    f[i] = 1 / size;
+    EACH(j, i + 1, s->count) {
+      double *g = s->factor + j * stride, one = g[i], other = g[i + 1];
+      g[i] = c * one + d * other;
+      g[i + 1] = c * other - d * one;
+    }
+  }
+}
+
+/* Take the rows to be active that had multipliers, without those that would have to pull. */
+static void begin(motion *s, working *set, const double *f, const double *multipliers, double least) {
+  long dim = s->nx + 1;
+  double a[dim];
+  EACH(i, 0, s->held) {
+    double was = multipliers[s->where[i]], sign = was > 0 ? 1 : -1, b = was > 0 ? s->high[dim + i] : -s->low[dim + i];
+    if (!(fabs(was) > least) || !isfinite(b) || set->count == dim) continue;
+    EACH(j, 0, dim) a[j] = sign * *entry(s, dim + i, j);
+    double square = project(set, a);
+    if (square > PARALLEL * dot(a, a, dim)) activate(set, a, b, sign, 0, dim + i, square);
+  }
+  for (long before = -1; before != set->count;) {
+    before = set->count;
+    EACH(i, 0, before) set->multiplier[i] = -set->b[i] - dot(set->a + i * set->stride, f, dim);
+    forward(set, set->multiplier);
+    backward(set, set->multiplier);
+    for (long i = before - 1; i >= 0; i--) if (set->multiplier[i] < 0) release(set, i);
+  }
+}
+
+/* Return the row that x breaks most, in multiples of its norm, or -1 where none is broken by more than `feasible`. */
+static long broken(const motion *s, const double *x, long count, double feasible, double *value) {
+  long dim = s->nx + 1, found = -1;
+  double most = feasible, r[B];
+  for (long first = 0; first < count; first += B) {
+    const double *block = entry(s, first, 0);
+    v sums[4] = {K(0), K(0), K(0), K(0)};
+    EACH(i, 0, dim) EACH(l, 0, 4) sums[l] += K(x[i]) * at(block + i * B + l * W);
+    EACH(l, 0, 4) put(r + l * W, sums[l]);
+    EACH(i, first, first + B < count ? first + B : count) {
+      double over = r[i - first] - s->high[i], under = s->low[i] - r[i - first], excess = (over > under ? over : under) * s->norm[i];
+      if (excess > most) most = excess, found = i, *value = r[i - first];
+    }
+  }
+  return found;
+}
+
+/* Make one broken row active, others inactive where they are in the way: 0 where that cannot be. */
+static int repair(const motion *s, working *set, double *x, long row, double value, int *changes) {
+  long dim = s->nx + 1;
+  double a[dim], sign = value > s->high[row] ? 1 : -1, b = sign > 0 ? s->high[row] : -s->low[row];
+  double excess = sign * value - b, multiplier = 0;
+  EACH(j, 0, dim) a[j] = sign * *entry(s, row, j);
+  double size = dot(a, a, dim);
+  for (; *changes > 0; --*changes) {
+    double square = project(set, a), longest = INFINITY, whole = square > PARALLEL * size ? excess / square : INFINITY;
+    long first = -1;
+    EACH(i, 0, set->count) if (set->share[i] > 0 && set->multiplier[i] < longest * set->share[i])
+      longest = set->multiplier[i] / set->share[i], first = i;
+    double t = whole < longest ? whole : longest;
+    if (!(t < INFINITY)) return 0;
+    multiplier += t;
+    EACH(i, 0, set->count) set->multiplier[i] -= t * set->share[i];
+    if (whole < INFINITY) { /* else x cannot move */
+      add(x, -t, a, dim);
+      EACH(i, 0, set->count) add(x, t * set->share[i], set->a + i * set->stride, dim);
+      excess -= t * square;
+    }
+    if (t == whole) {
+      activate(set, a, b, sign, multiplier, row, square);
+      return 1;
+    }
+    release(set, first);
+  }
+  return 0;
+}
+
+/* How far the rows may go, and what the elastic variable adds to them. */
+static void bound(motion *s, const double *g, const double *box, double softness, int relax) {
+  long dim = s->nx + 1;
+  EACH(i, 0, s->nx) s->high[i] = box[i], s->low[i] = -box[i];
+  *entry(s, s->nx, s->nx) = 1 / softness, s->low[s->nx] = 0, s->high[s->nx] = 1;
+  EACH(i, 0, s->held) {
+    long at = s->where[i];
+    double rise = s->upper[at] - g[at], fall = s->lower[at] - g[at], above = rise < 0, below = fall > 0, elastic;
+    if (relax) above = rise < -fall, below = !above, elastic = above ? -s->violation : s->violation;
+    else elastic = above ? rise : below ? fall : 0;
+    s->high[dim + i] = below ? INFINITY : rise;
+    s->low[dim + i] = above ? -INFINITY : fall;
+    *entry(s, dim + i, s->nx) = elastic / softness;
+  }
+  for (long first = 0; first < dim + s->held; first += B) {
+    v squares[4] = {K(0), K(0), K(0), K(0)};
+    EACH(i, 0, dim) EACH(l, 0, 4) { v x = at(entry(s, first, i) + l * W); squares[l] += x * x; }
+    EACH(l, 0, 4) put(s->norm + first + l * W, K(1) / vsqrt(squares[l]));
+  }
+}
+
+/* Solve the programme that `model` has laid out; 0 where it has no solution, or none in so many changes.
+
+The step is within the box, (nx,), and costs `slope` times the share of the violations that it leaves, which all rows may
+use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, `multipliers` those of the solution. */
+int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
+          double least, double feasible, int changes, double *dx, double *multipliers) {
+  long nx = s->nx, dim = nx + 1, stride = padded(dim + 1), count = dim + s->held;
+  bound(s, g, box, softness, relax);
+  double *f = s->scratch, *x = f + stride, *next = x + stride;
+  working set = {dim, stride, 0};
+  set.b = next, set.sign = set.b + stride, set.multiplier = set.sign + stride, set.product = set.multiplier + stride, set.share = set.product + stride;
+  set.a = set.share + stride, set.factor = set.a + dim * stride, set.row = s->active;
+  EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * nx, f, i)) * s->factor[i * nx + i];
+  f[nx] = slope / softness;
+  if (before) begin(s, &set, f, before, least);
+  EACH(i, 0, dim) x[i] = -f[i];
+  EACH(i, 0, set.count) add(x, -set.multiplier[i], set.a + i * stride, dim);
+  double value;
+  for (long row; (row = broken(s, x, count, feasible, &value)) >= 0;)
+    if (!repair(s, &set, x, row, value, &changes)) return 0;
+  EACH(i, 0, set.count) if (set.row[i] >= dim) multipliers[s->where[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
+  s->gain = -dot(f, x, nx) - 0.5 * dot(x, x, nx);
+  s->left = x[nx] / softness;
+  memcpy(dx, x, nx * sizeof(double));
+  for (long i = nx - 1; i >= 0; i--) {
+    dx[i] *= s->factor[i * nx + i];
+    add(dx, -dx[i], s->factor + i * nx, i);
+  }
+  return 1;
+}
