@@ -20,7 +20,8 @@ from cnpgen.trajectory.spline import end_derivatives
 Array = NDArray[np.float64]
 
 SOURCE = Path(__file__).with_name("step.c")
-BLOCK, TILE = 32, 8  # at least as many as step.c's B and TILE
+WIDEST, BLOCK, TILE = 8, 32, 8  # at least as many as step.c's W, B and TILE
+LINE = 8  # numbers in a line of the cache
 
 
 class _Bases(ctypes.Structure):
@@ -34,7 +35,7 @@ class _Motion(ctypes.Structure):
     """``motion`` of step.c."""
 
     _fields_ = (
-        *((name, c_long) for name in "n path rate fixed nx m gauss criteria thin".split()),
+        *((name, c_long) for name in "n path rate fixed nx stride m gauss criteria thin".split()),
         ("grid", _Bases),
         ("nodes", _Bases),
         *(
@@ -120,8 +121,8 @@ class CompiledSteps:
         rounded = ROUNDED if criterion is not None and criterion.kind == "centrifugal" else 0.0
         if stage.residuals is not None:
             count = stage.residuals.tape.outputs[0]
-        stride = nx + BLOCK
-        scratch = m * points + (width + 1) * m * TILE + nodes * (4 * n + 3) * (count + 1) + nodes * count
+        stride = nx + 2 + -(nx + 2) % WIDEST
+        scratch = m * points + (width + 1) * m * TILE + nodes * ((4 * n + 3) * (count + 1) + count) + (count + 1) * stride
         said = {
             "start_q": b.start_q, "start_dq": b.start_dq, "start_ddq": b.start_ddq, "goal_q": b.goal_q,
             "goal_dq": b.goal_dq, "goal_ddq": b.goal_ddq, "top": motion.tops_along, "quadrature": grid.gauss,
@@ -131,14 +132,14 @@ class CompiledSteps:
         }  # fmt: skip
         sizes = {
             "control": spec.path_control_points * n, "rates": spec.rate_control_points, "slope": 6 * n,
-            "w": width * points, "gradient": nx, "hessian": nx**2, "factor": nx**2, "rows": rows * (nx + 1),
+            "w": width * points, "gradient": stride, "hessian": nx * stride, "factor": nx * stride, "rows": rows * (nx + 1),
             "low": rows, "high": rows, "norm": rows, "where": m * points, "active": nx + 1,
             "scratch": scratch + (2 * stride + 10) * stride,
         }  # fmt: skip
         arrays = {name: None if array is None else self._keep(array) for name, array in said.items()}
-        arrays |= {name: self._keep(np.empty(size)) for name, size in sizes.items()}
+        arrays |= {name: self._keep(_aligned(size)) for name, size in sizes.items()}
         return _Motion(
-            n=n, path=spec.path_control_points, rate=spec.rate_control_points, fixed=3 + motion.interior, nx=nx, m=m,
+            n=n, path=spec.path_control_points, rate=spec.rate_control_points, fixed=3 + motion.interior, nx=nx, stride=stride, m=m,
             gauss=len(grid.weights), criteria=count, thin=thin, grid=self._bases(grid.bases),
             nodes=self._bases(grid.criterion), values=stage.values.address, jacobian=stage.jacobian.address,
             criterion=None if stage.residuals is None else stage.residuals.address,
@@ -154,6 +155,13 @@ class CompiledSteps:
         array = np.ascontiguousarray(array)
         self._kept.append(array)
         return address_of(array)
+
+
+def _aligned(size: int) -> Array:
+    """Make an array that begins where a line of the cache does."""
+    array = np.empty(size + LINE)
+    first = -(address_of(array) // array.itemsize) % LINE
+    return array[first : first + size]
 
 
 class CompiledModel:

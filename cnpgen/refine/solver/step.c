@@ -17,7 +17,7 @@ typedef struct { /* a spline basis at some phases */
 } bases;
 
 typedef struct {
-  long n, path, rate, fixed, nx, m, gauss, criteria, thin;
+  long n, path, rate, fixed, nx, stride, m, gauss, criteria, thin; /* stride: of rows of nx + 1, see below */
   bases grid, nodes;
   kernel *values, *jacobian, *criterion;
   const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be missing */
@@ -28,7 +28,7 @@ typedef struct {
   const double *lower, *upper;          /* (m, K) */
   const unsigned char *sharp;           /* (m, K) */
   double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, n), (width, K) */
-  double *gradient, *hessian, *factor;  /* (nx,), (nx, nx) each */
+  double *gradient, *hessian, *factor;  /* (nx,); above and below the diagonal, (nx, stride) each */
   double *rows, *low, *high, *norm;     /* blocks of B rows, (nx + 1, B) each; of every row */
   int *where, *active;                  /* residual i at point k of row nx + 1 + ... is number i K + k */
   double *scratch;
@@ -99,27 +99,50 @@ static void states(const motion *s, const bases *b, double *w) {
     add(w + (b->orders * n + o) * points, s->rates[c], b->rate + (o * s->rate + c) * points, points);
 }
 
-/* Gradient in the variables of a function whose gradient in w, at one phase, is J. */
+/* Take the gradient in w of residual i at one of `points` phases out of a Jacobian: joints (orders, padded n), then rates. */
+static void gather(const motion *s, long orders, const double *jacobian, long count, long i, long points, long k, double *J) {
+  long n = s->n, stride = padded(n);
+  EACH(o, 0, orders) EACH(j, 0, n) J[o * stride + j] = jacobian[((o * n + j) * count + i) * points + k];
+  EACH(o, 0, orders - 1) J[orders * stride + o] = jacobian[((orders * n + o) * count + i) * points + k];
+}
+
+/* Gradient in the variables of a function whose gradient in w, at phase k, is J; `row` has room for W more. */
 static void chain(const motion *s, const bases *b, long k, const double *J, double *row) {
-  long n = s->n, orders = b->orders, split = s->nx - s->rate;
+  long n = s->n, orders = b->orders, split = s->nx - s->rate, stride = padded(n);
   const double *path = b->path_at + k * s->path * orders, *rate = b->rate_at + k * s->rate * (orders - 1);
-  EACH(i, 0, s->rate) row[split + i] = dot(rate + i * (orders - 1), J + orders * n, orders - 1) * s->rates[i];
+  double ends[6 * stride], *next = ends;
+  memset(row, 0, split * sizeof(double));
+  memset(ends, 0, sizeof ends);
   EACH(c, 0, s->path) {
-    double control[n];
-    EACH(j, 0, n) control[j] = 0;
-    EACH(o, 0, orders) EACH(j, 0, n) control[j] += path[c * orders + o] * J[o * n + j];
-    if (c >= 3 && c < s->fixed) EACH(j, 0, n) row[(c - 3) * n + j] = control[j];
-    EACH(e, 0, s->slopes) if (s->point[e] == c)
-      row[split + s->variable[e]] += dot(control, s->slope + e * n, n) * s->rates[s->variable[e]];
+    int inside = c >= 3 && c < s->fixed, far = 1;
+    EACH(o, 0, orders) far &= path[c * orders + o] == 0;
+    double *control = inside ? row + (c - 3) * n : next;
+    if (!inside) next += stride;
+    if (far) { if (inside) EACH(j, 0, n) control[j] = 0; continue; }
+    for (long j = 0; j < n; j += W) {
+      v x = K(0);
+      EACH(o, 0, orders) x += K(path[c * orders + o]) * at(J + o * stride + j);
+      put(control + j, x);
+    }
+  }
+  EACH(i, 0, s->rate) {
+    double x = 0;
+    EACH(o, 0, orders - 1) x += rate[i * (orders - 1) + o] * J[orders * stride + o];
+    row[split + i] = x * s->rates[i];
+  }
+  EACH(e, 0, s->slopes) {
+    long c = s->point[e] < 3 ? s->point[e] : s->point[e] - s->fixed + 3;
+    row[split + s->variable[e]] += dot(ends + c * stride, s->slope + e * n, n) * s->rates[s->variable[e]];
   }
 }
 
 /* The criterion's integral; its gradient and Gauss-Newton Hessian are added where they are wanted. */
 static double criterion(motion *s, int derivatives) {
   const bases *b = &s->nodes;
-  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points, nx = s->nx;
-  double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points, *row = jacobian + width * count * points;
-  double J[width], cost = 0;
+  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points, nx = s->nx, stride = s->stride;
+  double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points, *rows = jacobian + width * count * points;
+  double J[width + b->orders * W], scaled[count], cost = 0;
+  memset(J, 0, sizeof J);
   states(s, b, w);
   s->criterion(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
   EACH(k, 0, points) {
@@ -132,10 +155,17 @@ static double criterion(motion *s, int derivatives) {
     EACH(i, 0, s->rate)
       s->gradient[nx - s->rate + i] -= share * rho / r * b->rate_at[(k * s->rate + i) * (b->orders - 1)] * s->rates[i];
     EACH(i, 0, count) {
-      EACH(j, 0, width) J[j] = jacobian[(j * count + i) * points + k];
-      chain(s, b, k, J, row);
-      add(s->gradient, share * slope * e[i * points + k], row, nx);
-      EACH(j, 0, nx) add(s->hessian + j * nx, share * slope * row[j], row, j + 1);
+      gather(s, b->orders, jacobian, count, i, points, k, J);
+      chain(s, b, k, J, rows + i * stride);
+      add(s->gradient, share * slope * e[i * points + k], rows + i * stride, nx);
+    }
+    EACH(j, 0, nx) {
+      EACH(i, 0, count) scaled[i] = share * slope * rows[i * stride + j];
+      for (long l = j / W * W; l < nx; l += W) {
+        v x = at(s->hessian + j * stride + l);
+        EACH(i, 0, count) x += K(scaled[i]) * at(rows + i * stride + l);
+        put(s->hessian + j * stride + l, x);
+      }
     }
   }
   return cost;
@@ -143,14 +173,14 @@ static double criterion(motion *s, int derivatives) {
 
 /* The time and what fixes the gauge; their gradient and curvature are set where they are wanted. */
 static double duration(motion *s, const double *log, int derivatives) {
-  long nx = s->nx, split = nx - s->rate;
+  long nx = s->nx, split = nx - s->rate, stride = s->stride;
   double cost = 0;
   EACH(i, 0, s->rate) {
     double pull = dot(s->smooth + i * s->rate, log, s->rate);
     cost += 0.5 * log[i] * pull;
     if (!derivatives) continue;
     s->gradient[split + i] = pull;
-    memcpy(s->hessian + (split + i) * nx + split, s->smooth + i * s->rate, s->rate * sizeof(double));
+    memcpy(s->hessian + (split + i) * stride + split, s->smooth + i * s->rate, s->rate * sizeof(double));
   }
   EACH(q, 0, s->gauss) {
     const double *basis = s->quadrature + q * s->rate;
@@ -160,7 +190,7 @@ static double duration(motion *s, const double *log, int derivatives) {
     EACH(i, 0, s->rate) slope[i] = basis[i] * s->rates[i];
     add(s->gradient + split, -weight * inverse, slope, s->rate);
     EACH(i, 0, s->rate) if (slope[i] != 0)
-      add(s->hessian + (split + i) * nx + split, 2 * weight * inverse * inverse * slope[i], slope, i + 1);
+      add(s->hessian + (split + i) * stride + split + i, 2 * weight * inverse * inverse * slope[i], slope + i, s->rate - i);
   }
   return cost;
 }
@@ -187,30 +217,35 @@ double look(motion *s, const double *x, double *g) {
 
 /* ---- The quadratic model there (choose and QuadraticModel) ---- */
 
-/* Factor the Hessian with the proximal term; what it is multiplied by to turn rows into variables where it is 1. */
+/* Factor the Hessian with the proximal term, diagonal inverted: dividing rows by it gives variables where it is 1. */
 static int factor(motion *s, double proximal) {
-  long nx = s->nx;
-  EACH(i, 0, nx) {
-    double *row = s->factor + i * nx;
-    EACH(j, 0, i) {
-      const double *other = s->factor + j * nx;
-      row[j] = (s->hessian[i * nx + j] - dot(row, other, j)) * other[j];
-    }
-    double pivot = s->hessian[i * nx + i] + proximal - dot(row, row, i);
+  long nx = s->nx, stride = s->stride;
+  EACH(k, 0, nx) {
+    double *row = s->hessian + k * stride, pivot = row[k] + proximal;
     if (!(pivot > 0)) return 0;
-    row[i] = 1 / sqrt(pivot);
+    double scale = 1 / sqrt(pivot);
+    EACH(i, k + 1, nx) s->factor[i * stride + k] = row[i] *= scale;
+    s->factor[k * stride + k] = scale;
+    EACH(i, k + 1, nx) add(s->hessian + i * stride + i, -row[i], row + i, nx - i);
   }
   return 1;
 }
 
-/* Divide B rows side by side, (nx, B), by the factor. */
-static void whiten(const motion *s, double *block) {
-  EACH(i, 0, s->nx) {
-    const double *row = s->factor + i * s->nx;
-    v x[4];
-    EACH(l, 0, 4) x[l] = at(block + i * B + l * W);
-    EACH(j, 0, i) EACH(l, 0, 4) x[l] -= K(row[j]) * at(block + j * B + l * W);
-    EACH(l, 0, 4) put(block + i * B + l * W, K(row[i]) * x[l]);
+/* Divide B rows side by side, (nx, B), by the factor; their first `from` entries are 0. */
+static void whiten(const motion *s, double *block, long from) {
+  for (long i = from; i < s->nx; i += 2) {
+    const double *row = s->factor + i * s->stride, *other = row + (i + 1 < s->nx ? s->stride : 0);
+    v x[4], y[4];
+    EACH(l, 0, 4) x[l] = at(block + i * B + l * W), y[l] = at(block + (i + 1) * B + l * W);
+    EACH(j, from, i) EACH(l, 0, 4) {
+      v above = at(block + j * B + l * W);
+      x[l] -= K(row[j]) * above;
+      y[l] -= K(other[j]) * above;
+    }
+    EACH(l, 0, 4) {
+      put(block + i * B + l * W, x[l] *= K(row[i]));
+      if (other != row) put(block + (i + 1) * B + l * W, (y[l] - K(other[i]) * x[l]) * K(other[i + 1]));
+    }
   }
 }
 
@@ -233,7 +268,7 @@ static double leap(const motion *s, long k, const double *J, double step) {
   EACH(o, 1, b->orders - 1) {
     double change = 0;
     EACH(i, 0, s->rate) change += fabs(b->rate_at[(k * s->rate + i) * (b->orders - 1) + o]) * s->rates[i];
-    reach += fabs(J[b->orders * s->n + o]) * change * step;
+    reach += fabs(J[b->orders * padded(s->n) + o]) * change * step;
   }
   return reach;
 }
@@ -246,13 +281,14 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
   unpack(s, x);
   states(s, &s->grid, s->w);
   memset(s->gradient, 0, nx * sizeof(double));
-  memset(s->hessian, 0, nx * nx * sizeof(double));
+  memset(s->hessian, 0, nx * s->stride * sizeof(double));
   duration(s, x + nx - s->rate, 1);
   if (s->criterion) criterion(s, 1);
   if (!factor(s, proximal)) return 0;
 
   double *excess = s->scratch, *values = excess + m * points, *jacobian = values + m * TILE, *row = jacobian + width * m * TILE;
-  double J[width];
+  double J[width + s->grid.orders * W];
+  memset(J, 0, sizeof J);
   EACH(i, 0, m * points) excess[i] = outside(s, g, i);
   EACH(i, 0, m) crest(s, excess + i * points, held + i * points);
   EACH(i, 0, m * points)
@@ -267,7 +303,7 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
     EACH(t, 0, tile) EACH(i, 0, m) {
       long k = first + t, number = i * points + k;
       if (!held[number] && !s->sharp[number]) continue;
-      EACH(j, 0, width) J[j] = jacobian[(j * m + i) * tile + t];
+      gather(s, s->grid.orders, jacobian, m, i, tile, t, J);
       if (!held[number] && !(excess[number] > -leap(s, k, J, step))) continue;
       held[number] = 1;
       s->where[count - nx - 1] = number;
@@ -277,7 +313,7 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
       count++;
     }
   }
-  for (long first = 0; first < count; first += B) whiten(s, entry(s, first, 0));
+  for (long first = 0; first < count; first += B) whiten(s, entry(s, first, 0), first + B <= nx ? first : 0);
   s->held = count - nx - 1;
   return 1;
 }
@@ -435,13 +471,13 @@ The step is within the box, (nx,), and costs `slope` times the share of the viol
 use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, `multipliers` those of the solution. */
 int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
           double least, double feasible, int changes, double *dx, double *multipliers) {
-  long nx = s->nx, dim = nx + 1, stride = padded(dim + 1), count = dim + s->held;
+  long nx = s->nx, dim = nx + 1, stride = s->stride, count = dim + s->held;
   bound(s, g, box, softness, relax);
   double *f = s->scratch, *x = f + stride, *next = x + stride;
   working set = {dim, stride, 0};
   set.b = next, set.sign = set.b + stride, set.multiplier = set.sign + stride, set.product = set.multiplier + stride, set.share = set.product + stride;
   set.a = set.share + stride, set.factor = set.a + dim * stride, set.row = s->active;
-  EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * nx, f, i)) * s->factor[i * nx + i];
+  EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * stride, f, i)) * s->factor[i * stride + i];
   f[nx] = slope / softness;
   if (before) begin(s, &set, f, before, least);
   EACH(i, 0, dim) x[i] = -f[i];
@@ -454,8 +490,8 @@ int solve(motion *s, const double *g, const double *box, double slope, double so
   s->left = x[nx] / softness;
   memcpy(dx, x, nx * sizeof(double));
   for (long i = nx - 1; i >= 0; i--) {
-    dx[i] *= s->factor[i * nx + i];
-    add(dx, -dx[i], s->factor + i * nx, i);
+    dx[i] *= s->factor[i * stride + i];
+    add(dx, -dx[i], s->factor + i * stride, i);
   }
   return 1;
 }
