@@ -258,14 +258,18 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     return _find(stem, cache_folder) or _compile(stem, lambda: emit(tape), optimisation(tape), cache_folder)
 
 
-def compile_source(path: Path, cache_folder: Path) -> Path:
+def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     """Return the library of C source that was written by hand, over the vectors of double that kernels use.
+
+    Args:
+        paths: Its files in the order in which they are read, as one; the last one names the library.
+        cache_folder: Where libraries are kept.
 
     Raises:
         MachineError: As of ``compile_tape``.
     """
-    text, level = prelude("float64") + path.read_text(encoding="utf-8"), "-O3"
-    stem = _stem(path.stem, text.encode(), level, require_compiler())
+    text, level = "".join([prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]), "-O3"
+    stem = _stem(paths[-1].stem, text.encode(), level, require_compiler())
     return _find(stem, cache_folder) or _compile(stem, lambda: text, level, cache_folder)
 
 

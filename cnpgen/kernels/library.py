@@ -116,13 +116,13 @@ class KernelLibrary:
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
 
-    def load_source(self, path: Path) -> ctypes.CDLL | None:
-        """Return the library of C source that is written by hand, or None where this library compiles nothing.
+    def load_source(self, *paths: Path) -> ctypes.CDLL | None:
+        """Return the library of C source that was written by hand, or None where kernels are not compiled.
 
         Args:
-            path: The source; ``vectors.h`` is put before it.
+            paths: Its files, as of ``compile_source``.
         """
-        return ctypes.CDLL(str(compile_source(path, self.cache_folder))) if self.backend == "compiled" else None
+        return ctypes.CDLL(str(compile_source(paths, self.cache_folder))) if self.backend == "compiled" else None
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
         """Return the operations of the SX function that ``builder`` builds; nothing is compiled.

@@ -19,7 +19,7 @@ from cnpgen.trajectory.spline import end_derivatives
 
 Array = NDArray[np.float64]
 
-SOURCE = Path(__file__).with_name("step.c")
+SOURCES = [Path(__file__).with_name(name) for name in ("nearest.c", "step.c")]
 WIDEST, BLOCK, TILE = 8, 32, 8  # at least as many as step.c's W, B and TILE
 LINE = 8  # numbers in a line of the cache
 
@@ -31,32 +31,37 @@ class _Bases(ctypes.Structure):
     )
 
 
+class _Polyhedron(ctypes.Structure):
+    """``polyhedron`` of nearest.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in ("dim", "stride", "count")),
+        *((name, c_void_p) for name in ("rows", "low", "high", "norm", "scratch", "active")),
+    )
+
+
 class _Motion(ctypes.Structure):
     """``motion`` of step.c."""
 
     _fields_ = (
-        *((name, c_long) for name in "n path rate fixed nx stride m gauss criteria thin".split()),
-        ("grid", _Bases),
-        ("nodes", _Bases),
-        *(
-            (name, c_void_p)
-            for name in (
-                "values jacobian criterion start_q start_dq start_ddq goal_q goal_dq goal_ddq top quadrature weights"
-                " criterion_weights smooth lower upper sharp control rates slope w gradient hessian factor rows low high"
-                " norm where active scratch"
-            ).split()
-        ),
-        *((name, c_double) for name in "eta beta rate_eta rounded violation gain left".split()),
-        ("point", c_long * 6),
-        ("variable", c_long * 6),
-        ("slopes", c_long),
-        ("held", c_long),
+        *((name, c_long) for name in ("n", "path", "rate", "fixed", "nx", "stride", "m", "gauss", "criteria", "thin")),
+        *((name, _Bases) for name in ("grid", "nodes")),
+        *((name, c_void_p) for name in ("values", "jacobian", "criterion")),
+        *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
+        *((name, c_void_p) for name in ("top", "quadrature", "weights", "criterion_weights", "smooth")),
+        *((name, c_void_p) for name in ("lower", "upper", "sharp")),
+        *((name, c_void_p) for name in ("control", "rates", "slope", "w", "gradient", "hessian", "factor", "scratch")),
+        *((name, c_void_p) for name in ("where", "first")),
+        ("programme", _Polyhedron),
+        *((name, c_double) for name in ("eta", "beta", "rate_eta", "rounded", "violation", "gain", "left")),
+        *((name, c_long * 6) for name in ("point", "variable")),
+        *((name, c_long) for name in ("slopes", "held")),
     )
 
 
 def load_steps(kernels: KernelLibrary) -> ctypes.CDLL | None:
     """Return the library of step.c, or None where kernels are not compiled."""
-    library = kernels.load_source(SOURCE)
+    library = kernels.load_source(*SOURCES)
     if library is not None:
         library.look.argtypes, library.look.restype = (c_void_p,) * 3, c_double
         library.model.argtypes = (*(c_void_p,) * 3, *(c_double,) * 3, *(c_void_p,) * 3)
@@ -112,39 +117,79 @@ class CompiledSteps:
         return Step(dx, found.left, multipliers.T, found.gain) if np.isfinite(dx).all() else None
 
     def _describe(self, motion: Transcription, bounds: Bounds, thin: int) -> _Motion:
-        stage, grid, spec, b = motion.stage, motion.grid, motion.spec, motion.boundary
-        n, nx, m, points = motion.n, motion.nx, self._m, self._points
-        width, rows = stage.values.tape.inputs[0], nx + 1 + m * points + BLOCK
+        spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % WIDEST
         path = end_derivatives(spec.path_control_points, spec.degree)
         rate = end_derivatives(spec.rate_control_points, spec.degree)
-        criterion, nodes, count = stage.criterion, len(grid.criterion_weights), 0
-        rounded = ROUNDED if criterion is not None and criterion.kind == "centrifugal" else 0.0
-        if stage.residuals is not None:
-            count = stage.residuals.tape.outputs[0]
-        stride = nx + 2 + -(nx + 2) % WIDEST
-        scratch = m * points + (width + 1) * m * TILE + nodes * ((4 * n + 3) * (count + 1) + count) + (count + 1) * stride
-        said = {
-            "start_q": b.start_q, "start_dq": b.start_dq, "start_ddq": b.start_ddq, "goal_q": b.goal_q,
-            "goal_dq": b.goal_dq, "goal_ddq": b.goal_ddq, "top": motion.tops_along, "quadrature": grid.gauss,
-            "weights": grid.weights, "smooth": motion.smooth, "lower": bounds.lower.T, "upper": bounds.upper.T,
-            "sharp": bounds.sharp.T,
-            "criterion_weights": (0.0 if criterion is None else criterion.weight) * grid.criterion_weights,
-        }  # fmt: skip
-        sizes = {
-            "control": spec.path_control_points * n, "rates": spec.rate_control_points, "slope": 6 * n,
-            "w": width * points, "gradient": stride, "hessian": nx * stride, "factor": nx * stride, "rows": rows * (nx + 1),
-            "low": rows, "high": rows, "norm": rows, "where": m * points, "active": nx + 1,
-            "scratch": scratch + (2 * stride + 10) * stride,
-        }  # fmt: skip
-        arrays = {name: None if array is None else self._keep(array) for name, array in said.items()}
-        arrays |= {name: self._keep(_aligned(size)) for name, size in sizes.items()}
         return _Motion(
-            n=n, path=spec.path_control_points, rate=spec.rate_control_points, fixed=3 + motion.interior, nx=nx, stride=stride, m=m,
-            gauss=len(grid.weights), criteria=count, thin=thin, grid=self._bases(grid.bases),
-            nodes=self._bases(grid.criterion), values=stage.values.address, jacobian=stage.jacobian.address,
-            criterion=None if stage.residuals is None else stage.residuals.address,
-            eta=path.eta, beta=path.beta, rate_eta=rate.eta, rounded=rounded, **arrays,
-        )  # fmt: skip
+            n=motion.n,
+            path=spec.path_control_points,
+            rate=spec.rate_control_points,
+            fixed=3 + motion.interior,
+            nx=motion.nx,
+            stride=stride,
+            m=self._m,
+            thin=thin,
+            eta=path.eta,
+            beta=path.beta,
+            rate_eta=rate.eta,
+            programme=self._programme(stride),
+            **self._given(motion, bounds),
+            **self._kernels(motion),
+            **self._memory(motion, stride),
+        )
+
+    def _given(self, motion: Transcription, bounds: Bounds) -> dict[str, Any]:
+        """Numbers that no step changes."""
+        grid, weight = motion.grid, 0.0 if motion.stage.criterion is None else motion.stage.criterion.weight
+        said = {
+            **vars(motion.boundary),
+            "top": motion.tops_along,
+            "quadrature": grid.gauss,
+            "weights": grid.weights,
+            "criterion_weights": weight * grid.criterion_weights,
+            "smooth": motion.smooth,
+            "lower": bounds.lower.T,
+            "upper": bounds.upper.T,
+            "sharp": bounds.sharp.T,
+        }
+        found: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in said.items()}
+        return found | {"grid": self._bases(grid.bases), "nodes": self._bases(grid.criterion), "gauss": len(grid.weights)}
+
+    def _kernels(self, motion: Transcription) -> dict[str, Any]:
+        """The compiled kernels, and what the criterion's are of."""
+        stage = motion.stage
+        found = {"values": stage.values.address, "jacobian": stage.jacobian.address}
+        if stage.criterion is None or stage.residuals is None:
+            return found
+        rounded = ROUNDED if stage.criterion.kind == "centrifugal" else 0.0
+        count = stage.residuals.tape.outputs[0]
+        return {**found, "criterion": stage.residuals.address, "criteria": count, "rounded": rounded}
+
+    def _memory(self, motion: Transcription, stride: int) -> dict[str, int]:
+        """Memory of as many numbers as step.c says."""
+        spec, n, nx, size = motion.spec, motion.n, motion.nx, self._m * self._points
+        width, nodes = motion.stage.values.tape.inputs[0], len(motion.grid.criterion_weights)
+        count = 0 if motion.stage.residuals is None else motion.stage.residuals.tape.outputs[0]
+        criterion = nodes * ((4 * n + 3) * (count + 1) + count) + (count + 1) * stride
+        sizes = {
+            "control": spec.path_control_points * n,
+            "rates": spec.rate_control_points,
+            "slope": 6 * n,
+            "w": width * self._points,
+            "gradient": nx,
+            "hessian": nx * stride,
+            "factor": nx * stride,
+            "scratch": max(size + (width + 1) * self._m * TILE + stride, criterion),
+            "where": size,
+            "first": size,
+        }
+        return {name: self._keep(_aligned(size)) for name, size in sizes.items()}
+
+    def _programme(self, stride: int) -> _Polyhedron:
+        dim = self._nx + 1
+        rows = dim + self._m * self._points + BLOCK
+        sizes = (rows * dim, rows, rows, rows, (2 * dim + 8) * stride, dim)  # rows, low, high, norm, scratch, active
+        return _Polyhedron(dim, stride, 0, *(self._keep(_aligned(size)) for size in sizes))
 
     def _bases(self, bases: Bases) -> _Bases:
         orders, points, _ = bases.path.shape

@@ -1,12 +1,10 @@
 /* One step of the sequential quadratic programme of one motion: what transcription.py and quadratic.py say in NumPy, over
-the same compiled kernels, and the nearest point of a polyhedron in the place of DAQP.
+the same compiled kernels.
 
 Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n joints,
-nx variables; w = (p, p', ..., r, r', ...) of `width` components. vectors.h comes first. */
+nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
 
-#define B (4 * W) /* rows of the quadratic programme that are laid out side by side */
 #define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
-#define EACH(i, from, to) for (long i = (from); i < (to); i++)
 
 typedef void kernel(long, const double *const *, const long *, double *const *);
 
@@ -29,32 +27,12 @@ typedef struct {
   const unsigned char *sharp;           /* (m, K) */
   double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, n), (width, K) */
   double *gradient, *hessian, *factor;  /* (nx,); above and below the diagonal, (nx, stride) each */
-  double *rows, *low, *high, *norm;     /* blocks of B rows, (nx + 1, B) each; of every row */
-  int *where, *active;                  /* residual i at point k of row nx + 1 + ... is number i K + k */
   double *scratch;
+  int *where, *first; /* row nx + 1 + j is of residual i at point k: where[j] = i K + k; room for as many */
+  polyhedron programme; /* of the box, (nx,), the elastic variable, and the held residuals */
   double eta, beta, rate_eta, rounded, violation, gain, left;
   long point[6], variable[6], slopes, held;
 } motion;
-
-I double sum(v x) { double s = 0; EACH(i, 0, W) s += x[i]; return s; }
-I v at(const double *p) { return *(const vu *)p; }
-I void put(double *p, v x) { *(vu *)p = x; }
-I long padded(long n) { return (n + W - 1) / W * W; }
-
-static double dot(const double *a, const double *b, long n) {
-  v s = K(0);
-  double rest = 0;
-  long i = 0;
-  for (; i + W <= n; i += W) s += at(a + i) * at(b + i);
-  for (; i < n; i++) rest += a[i] * b[i];
-  return sum(s) + rest;
-}
-
-static void add(double *restrict a, double f, const double *restrict b, long n) {
-  long i = 0;
-  for (; i + W <= n; i += W) put(a + i, at(a + i) + K(f) * at(b + i));
-  for (; i < n; i++) a[i] += f * b[i];
-}
 
 /* ---- The motion of variables x: control points, states, objective (Transcription) ---- */
 
@@ -249,8 +227,6 @@ static void whiten(const motion *s, double *block, long from) {
   }
 }
 
-I double *entry(const motion *s, long row, long i) { return s->rows + (row / B) * (s->nx + 1) * B + i * B + row % B; }
-
 /* How far outside residual i is at point k, and whether it is a crest along the motion, beside one, or in the thin grid. */
 I double outside(const motion *s, const double *g, long at) {
   return g[at] - s->upper[at] > s->lower[at] - g[at] ? g[at] - s->upper[at] : s->lower[at] - g[at];
@@ -295,8 +271,9 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
     held[i] = (held[i] && excess[i] > -near) || missed[i] || (multipliers && multipliers[i] != 0);
 
   long count = nx + 1;
-  memset(s->rows, 0, (count + B) / B * (nx + 1) * B * sizeof(double));
-  EACH(i, 0, nx) *entry(s, i, i) = 1;
+  polyhedron *p = &s->programme;
+  memset(p->rows, 0, (count + B) / B * count * B * sizeof(double));
+  EACH(i, 0, nx) *entry(p, i, i) = 1;
   for (long first = 0; first < points; first += TILE) {
     long tile = points - first < TILE ? points - first : TILE, ld[2] = {points, points};
     s->jacobian(tile, (const double *const[]){s->w + first, s->top + first}, ld, (double *const[]){values, jacobian});
@@ -308,183 +285,51 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
       held[number] = 1;
       s->where[count - nx - 1] = number;
       chain(s, &s->grid, k, J, row);
-      if (count % B == 0) memset(entry(s, count, 0), 0, (nx + 1) * B * sizeof(double));
-      EACH(j, 0, nx) *entry(s, count, j) = row[j];
+      if (count % B == 0) memset(entry(p, count, 0), 0, (nx + 1) * B * sizeof(double));
+      EACH(j, 0, nx) *entry(p, count, j) = row[j];
       count++;
     }
   }
-  for (long first = 0; first < count; first += B) whiten(s, entry(s, first, 0), first + B <= nx ? first : 0);
-  s->held = count - nx - 1;
+  for (long first = 0; first < count; first += B) whiten(s, entry(p, first, 0), first + B <= nx ? first : 0);
+  s->held = count - nx - 1, p->count = count;
   return 1;
-}
-
-/* ---- Its solution: the point of a polyhedron that is nearest to -f (Goldfarb and Idnani, Math. Programming 27, 1983) ---- */
-
-#define PARALLEL 1e-11 /* of its square: what is left of a row that depends on active ones */
-
-typedef struct { /* active rows a, with signs so that a x <= b, and the factor of their products, whose diagonal is inverted */
-  long dim, stride, count;
-  double *a, *factor, *b, *sign, *multiplier, *product, *share;
-  int *row;
-} working;
-
-/* Solve factor x = y, or with the transposed one, in place. */
-static void forward(const working *s, double *y) {
-  EACH(i, 0, s->count) y[i] = (y[i] - dot(s->factor + i * s->stride, y, i)) * s->factor[i * s->stride + i];
-}
-static void backward(const working *s, double *y) {
-  for (long i = s->count - 1; i >= 0; i--) {
-    y[i] *= s->factor[i * s->stride + i];
-    add(y, -y[i], s->factor + i * s->stride, i);
-  }
-}
-
-/* Put a row that would come next into the basis of the active ones: its square without them is returned, `share` are its
-coefficients in them. */
-static double project(working *s, const double *a) {
-  EACH(i, 0, s->count) s->product[i] = dot(s->a + i * s->stride, a, s->dim);
-  forward(s, s->product);
-  memcpy(s->share, s->product, s->count * sizeof(double));
-  backward(s, s->share);
-  return dot(a, a, s->dim) - dot(s->product, s->product, s->count);
-}
-
-static void activate(working *s, const double *a, double b, double sign, double multiplier, long row, double square) {
-  long k = s->count++;
-  memmove(s->a + k * s->stride, a, s->dim * sizeof(double));
-  memcpy(s->factor + k * s->stride, s->product, k * sizeof(double));
-  s->factor[k * s->stride + k] = 1 / sqrt(square);
-  s->b[k] = b, s->sign[k] = sign, s->multiplier[k] = multiplier, s->row[k] = (int)row;
-}
-
-static void release(working *s, long k) {
-  long stride = s->stride;
-  s->count--;
-  EACH(i, k, s->count) { /* rows move up; rotations of neighbouring columns make the factor triangular again */
-    memcpy(s->a + i * stride, s->a + (i + 1) * stride, s->dim * sizeof(double));
-    memcpy(s->factor + i * stride, s->factor + (i + 1) * stride, (i + 2) * sizeof(double));
-    s->b[i] = s->b[i + 1], s->sign[i] = s->sign[i + 1], s->multiplier[i] = s->multiplier[i + 1], s->row[i] = s->row[i + 1];
-  }
-  EACH(i, k, s->count) {
-    double *f = s->factor + i * stride, last = 1 / f[i + 1], size = sqrt(f[i] * f[i] + last * last);
-    double c = f[i] / size, d = last / size;
-    f[i] = 1 / size;
-    EACH(j, i + 1, s->count) {
-      double *g = s->factor + j * stride, one = g[i], other = g[i + 1];
-      g[i] = c * one + d * other;
-      g[i + 1] = c * other - d * one;
-    }
-  }
-}
-
-/* Take the rows to be active that had multipliers, without those that would have to pull. */
-static void begin(motion *s, working *set, const double *f, const double *multipliers, double least) {
-  long dim = s->nx + 1;
-  double a[dim];
-  EACH(i, 0, s->held) {
-    double was = multipliers[s->where[i]], sign = was > 0 ? 1 : -1, b = was > 0 ? s->high[dim + i] : -s->low[dim + i];
-    if (!(fabs(was) > least) || !isfinite(b) || set->count == dim) continue;
-    EACH(j, 0, dim) a[j] = sign * *entry(s, dim + i, j);
-    double square = project(set, a);
-    if (square > PARALLEL * dot(a, a, dim)) activate(set, a, b, sign, 0, dim + i, square);
-  }
-  for (long before = -1; before != set->count;) {
-    before = set->count;
-    EACH(i, 0, before) set->multiplier[i] = -set->b[i] - dot(set->a + i * set->stride, f, dim);
-    forward(set, set->multiplier);
-    backward(set, set->multiplier);
-    for (long i = before - 1; i >= 0; i--) if (set->multiplier[i] < 0) release(set, i);
-  }
-}
-
-/* Return the row that x breaks most, in multiples of its norm, or -1 where none is broken by more than `feasible`. */
-static long broken(const motion *s, const double *x, long count, double feasible, double *value) {
-  long dim = s->nx + 1, found = -1;
-  double most = feasible, r[B];
-  for (long first = 0; first < count; first += B) {
-    const double *block = entry(s, first, 0);
-    v sums[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, 0, dim) EACH(l, 0, 4) sums[l] += K(x[i]) * at(block + i * B + l * W);
-    EACH(l, 0, 4) put(r + l * W, sums[l]);
-    EACH(i, first, first + B < count ? first + B : count) {
-      double over = r[i - first] - s->high[i], under = s->low[i] - r[i - first], excess = (over > under ? over : under) * s->norm[i];
-      if (excess > most) most = excess, found = i, *value = r[i - first];
-    }
-  }
-  return found;
-}
-
-/* Make one broken row active, others inactive where they are in the way: 0 where that cannot be. */
-static int repair(const motion *s, working *set, double *x, long row, double value, int *changes) {
-  long dim = s->nx + 1;
-  double a[dim], sign = value > s->high[row] ? 1 : -1, b = sign > 0 ? s->high[row] : -s->low[row];
-  double excess = sign * value - b, multiplier = 0;
-  EACH(j, 0, dim) a[j] = sign * *entry(s, row, j);
-  double size = dot(a, a, dim);
-  for (; *changes > 0; --*changes) {
-    double square = project(set, a), longest = INFINITY, whole = square > PARALLEL * size ? excess / square : INFINITY;
-    long first = -1;
-    EACH(i, 0, set->count) if (set->share[i] > 0 && set->multiplier[i] < longest * set->share[i])
-      longest = set->multiplier[i] / set->share[i], first = i;
-    double t = whole < longest ? whole : longest;
-    if (!(t < INFINITY)) return 0;
-    multiplier += t;
-    EACH(i, 0, set->count) set->multiplier[i] -= t * set->share[i];
-    if (whole < INFINITY) { /* else x cannot move */
-      add(x, -t, a, dim);
-      EACH(i, 0, set->count) add(x, t * set->share[i], set->a + i * set->stride, dim);
-      excess -= t * square;
-    }
-    if (t == whole) {
-      activate(set, a, b, sign, multiplier, row, square);
-      return 1;
-    }
-    release(set, first);
-  }
-  return 0;
 }
 
 /* How far the rows may go, and what the elastic variable adds to them. */
 static void bound(motion *s, const double *g, const double *box, double softness, int relax) {
   long dim = s->nx + 1;
-  EACH(i, 0, s->nx) s->high[i] = box[i], s->low[i] = -box[i];
-  *entry(s, s->nx, s->nx) = 1 / softness, s->low[s->nx] = 0, s->high[s->nx] = 1;
+  const polyhedron *p = &s->programme;
+  EACH(i, 0, s->nx) p->high[i] = box[i], p->low[i] = -box[i];
+  *entry(p, s->nx, s->nx) = 1 / softness, p->low[s->nx] = 0, p->high[s->nx] = 1;
   EACH(i, 0, s->held) {
     long at = s->where[i];
     double rise = s->upper[at] - g[at], fall = s->lower[at] - g[at], above = rise < 0, below = fall > 0, elastic;
     if (relax) above = rise < -fall, below = !above, elastic = above ? -s->violation : s->violation;
     else elastic = above ? rise : below ? fall : 0;
-    s->high[dim + i] = below ? INFINITY : rise;
-    s->low[dim + i] = above ? -INFINITY : fall;
-    *entry(s, dim + i, s->nx) = elastic / softness;
-  }
-  for (long first = 0; first < dim + s->held; first += B) {
-    v squares[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, 0, dim) EACH(l, 0, 4) { v x = at(entry(s, first, i) + l * W); squares[l] += x * x; }
-    EACH(l, 0, 4) put(s->norm + first + l * W, K(1) / vsqrt(squares[l]));
+    p->high[dim + i] = below ? INFINITY : rise;
+    p->low[dim + i] = above ? -INFINITY : fall;
+    *entry(p, dim + i, s->nx) = elastic / softness;
   }
 }
 
 /* Solve the programme that `model` has laid out; 0 where it has no solution, or none in so many changes.
 
 The step is within the box, (nx,), and costs `slope` times the share of the violations that it leaves, which all rows may
-use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, `multipliers` those of the solution. */
+use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, if they are more than `least`;
+`multipliers` are those of the solution. */
 int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
           double least, double feasible, int changes, double *dx, double *multipliers) {
-  long nx = s->nx, dim = nx + 1, stride = s->stride, count = dim + s->held;
+  long nx = s->nx, dim = nx + 1, stride = s->stride, count = 0;
+  double f[dim], x[dim];
   bound(s, g, box, softness, relax);
-  double *f = s->scratch, *x = f + stride, *next = x + stride;
-  working set = {dim, stride, 0};
-  set.b = next, set.sign = set.b + stride, set.multiplier = set.sign + stride, set.product = set.multiplier + stride, set.share = set.product + stride;
-  set.a = set.share + stride, set.factor = set.a + dim * stride, set.row = s->active;
   EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * stride, f, i)) * s->factor[i * stride + i];
   f[nx] = slope / softness;
-  if (before) begin(s, &set, f, before, least);
-  EACH(i, 0, dim) x[i] = -f[i];
-  EACH(i, 0, set.count) add(x, -set.multiplier[i], set.a + i * stride, dim);
-  double value;
-  for (long row; (row = broken(s, x, count, feasible, &value)) >= 0;)
-    if (!repair(s, &set, x, row, value, &changes)) return 0;
+  if (before) EACH(i, 0, s->held) {
+    double was = before[s->where[i]];
+    if (fabs(was) > least) s->first[count++] = (int)(was > 0 ? dim + i + 1 : -(dim + i + 1));
+  }
+  working set;
+  if (!nearest(&s->programme, f, s->first, count, feasible, changes, x, &set)) return 0;
   EACH(i, 0, set.count) if (set.row[i] >= dim) multipliers[s->where[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
   s->gain = -dot(f, x, nx) - 0.5 * dot(x, x, nx);
   s->left = x[nx] / softness;
