@@ -49,9 +49,9 @@ class CompiledKernel(Kernel):
         return results
 
     @property
-    def address(self) -> int:
-        """Where the machine code begins, for other compiled code."""
-        return ctypes.cast(self._function, ctypes.c_void_p).value or 0
+    def address(self) -> int | None:
+        """Where its machine code begins; see ``Kernel``."""
+        return ctypes.cast(self._function, ctypes.c_void_p).value
 
 
 class CompiledGridKernel(GridKernel):

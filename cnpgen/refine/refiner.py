@@ -115,7 +115,12 @@ class Refiner:
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
         self.stage = ResidualKernels(
-            self.spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals, load_steps(kernels)
+            self.spec,
+            kernels.load(stage_values),
+            kernels.load(stage_jacobian),
+            criterion,
+            residuals,
+            load_steps(kernels),
         )
         self.passes = default_passes(problem, settings) if passes is None else passes
         self.check = FineCheck(problem, world, self.stage)

@@ -13,7 +13,7 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.criterion import ROUNDED
 from cnpgen.refine.solver.grid import Bases
-from cnpgen.refine.solver.quadratic import CHANGES, FEASIBLE, MULTIPLIER, SOFTNESS, USED, Near, Mask, Step
+from cnpgen.refine.solver.quadratic import CHANGES, MULTIPLIER, SOFTNESS, USED, Mask, Near, Step
 from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.trajectory.spline import end_derivatives
 
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 SOURCES = [Path(__file__).with_name(name) for name in ("nearest.c", "step.c")]
 WIDEST, BLOCK, TILE = 8, 32, 8  # at least as many as step.c's W, B and TILE
 LINE = 8  # numbers in a line of the cache
+FEASIBLE = 1e-8  # of nearest.c
 
 
 class _Bases(ctypes.Structure):
@@ -153,7 +154,8 @@ class CompiledSteps:
             "sharp": bounds.sharp.T,
         }
         found: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in said.items()}
-        return found | {"grid": self._bases(grid.bases), "nodes": self._bases(grid.criterion), "gauss": len(grid.weights)}
+        found |= {"grid": self._bases(grid.bases), "nodes": self._bases(grid.criterion)}
+        return {**found, "gauss": len(grid.weights)}
 
     def _kernels(self, motion: Transcription) -> dict[str, Any]:
         """The compiled kernels, and what the criterion's are of."""

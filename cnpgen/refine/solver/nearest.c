@@ -5,6 +5,7 @@ are taken to be active at first are so at once, and that it is compiled for the 
 #define EACH(i, from, to) for (long i = (from); i < (to); i++)
 #define B (4 * W) /* rows that lie side by side */
 #define PARALLEL 1e-11 /* of its square: what is left of a row that depends on active ones */
+#define ROUNDS 4 /* one and a look at what it came to are enough nearly always */
 
 I double sum(v x) { double s = 0; EACH(i, 0, W) s += x[i]; return s; }
 I v at(const double *p) { return *(const vu *)p; }
@@ -90,8 +91,8 @@ static void release(working *s, long k) {
   }
 }
 
-/* Take rows to be active, with signs, without those that would have to pull. */
-static void begin(const polyhedron *p, working *set, const double *f, const int *first, long count) {
+/* Take rows to be active. */
+static void begin(const polyhedron *p, working *set, const int *first, long count) {
   double a[p->dim];
   EACH(i, 0, count) {
     long row = (first[i] > 0 ? first[i] : -first[i]) - 1;
@@ -101,6 +102,11 @@ static void begin(const polyhedron *p, working *set, const double *f, const int 
     double square = project(set, a);
     if (square > PARALLEL * dot(a, a, p->dim)) activate(set, a, b, sign, 0, row, square);
   }
+}
+
+/* Find x and the multipliers of what is active, without what would have to pull; after many changes more exactly than they
+are known. */
+static void settle(const polyhedron *p, working *set, const double *f, double *x) {
   for (long before = -1; before != set->count;) {
     before = set->count;
     EACH(i, 0, before) set->multiplier[i] = -set->b[i] - dot(set->a + i * set->stride, f, p->dim);
@@ -108,6 +114,8 @@ static void begin(const polyhedron *p, working *set, const double *f, const int 
     backward(set, set->multiplier);
     for (long i = before - 1; i >= 0; i--) if (set->multiplier[i] < 0) release(set, i);
   }
+  EACH(i, 0, p->dim) x[i] = -f[i];
+  EACH(i, 0, set->count) add(x, -set->multiplier[i], set->a + i * set->stride, p->dim);
 }
 
 /* Return the row that x breaks most, in multiples of its norm, or -1 where none is broken by more than `feasible`. */
@@ -178,11 +186,14 @@ static int nearest(const polyhedron *p, const double *f, const int *first, long 
   set->share = set->product + stride, set->a = set->share + stride, set->factor = set->a + dim * stride;
   set->row = p->active;
   measure(p);
-  begin(p, set, f, first, n_first);
-  EACH(i, 0, dim) x[i] = -f[i];
-  EACH(i, 0, set->count) add(x, -set->multiplier[i], set->a + i * stride, dim);
-  double value;
-  for (long row; (row = broken(p, x, feasible, &value)) >= 0;)
-    if (!repair(p, set, x, row, value, &changes)) return 0;
+  begin(p, set, first, n_first);
+  for (int round = 0; round < ROUNDS; round++) {
+    double value;
+    long row;
+    settle(p, set, f, x);
+    if ((row = broken(p, x, feasible, &value)) < 0) return 1;
+    for (; row >= 0; row = broken(p, x, feasible, &value))
+      if (!repair(p, set, x, row, value, &changes)) return 0;
+  }
   return 1;
 }

@@ -64,9 +64,11 @@ class Near:
 
 
 class Model(Protocol):
-    """The quadratic programmes near a point; ``held`` says which residuals they hold, shape (K, m)."""
+    """The quadratic programmes near a point."""
 
-    held: Mask
+    @property
+    def held(self) -> Mask:
+        """Which residuals they hold, shape (K, m)."""
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> "Step | None":
         """Return the best step within the box, or None where there is none.

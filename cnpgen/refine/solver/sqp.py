@@ -121,7 +121,7 @@ def _cheaper(one: Result | None, other: Result) -> Result:
 
 def steps_of(motion: Transcription, bounds: Bounds, thin: int) -> Steps:
     """Return the steps of a motion, compiled where its kernels are."""
-    return (PlainSteps if motion.stage.steps is None else CompiledSteps)(motion, bounds, thin)
+    return PlainSteps(motion, bounds, thin) if motion.stage.steps is None else CompiledSteps(motion, bounds, thin)
 
 
 class _Descent:
