@@ -76,6 +76,21 @@ def test_plans_are_as_good_as_those_of_numpy_and_daqp(label: str, given: bool) -
     assert fast.cost == pytest.approx(slow.cost, rel=2e-4)
 
 
+def test_what_is_not_solved_in_so_many_changes_is_daqps(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = load("replan")
+    tool, problem = refiner_of(plan), task(plan)
+    motion = tool.transcription(problem, tool.passes.first)
+    steps = CompiledSteps(motion, tool.bounds(problem, tool.passes.first, motion.end_residuals()), 6)
+    x = tool.straight(problem)
+    _, g, violation = steps.value(x)
+    near = Near(violation, 0.3, 0.3, np.zeros(g.shape, bool), None)
+    model, box = steps.model(x, g, near, proximal=0.02, penalty=2.0), np.full(motion.nx, 0.1)
+    wanted = model.solve(box)
+    monkeypatch.setattr(compiled, "CHANGES", 1)
+    assert steps.solve(model, box, None, relax=False) is None
+    np.testing.assert_allclose(model.solve(box).dx, wanted.dx, atol=1e-4)
+
+
 def test_steps_are_numpys_where_kernels_are_not_compiled(tmp_path) -> None:
     plan = load("hit")
     kernels = problem_kernels(plan.problem, plan.robot, "numpy", tmp_path)

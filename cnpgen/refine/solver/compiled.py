@@ -1,7 +1,10 @@
-"""The same steps in compiled code (``step.c``): several times as fast, and equal but for rounding."""
+"""Steps in compiled code, ``step.c`` and ``nearest.c``: those of NumPy and DAQP but for rounding, several times as fast."""
 
 import ctypes
+from collections.abc import Callable
 from ctypes import c_double, c_int, c_long, c_void_p
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,18 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.criterion import ROUNDED
 from cnpgen.refine.solver.grid import Bases
-from cnpgen.refine.solver.quadratic import CHANGES, MULTIPLIER, SOFTNESS, USED, Mask, Near, Step
+from cnpgen.refine.solver.quadratic import (
+    CHANGES,
+    FEASIBLE,
+    MULTIPLIER,
+    SOFTNESS,
+    USED,
+    Mask,
+    Model,
+    Near,
+    PlainSteps,
+    Step,
+)
 from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.trajectory.spline import end_derivatives
 
@@ -22,7 +36,6 @@ Array = NDArray[np.float64]
 SOURCES = [Path(__file__).with_name(name) for name in ("nearest.c", "step.c")]
 WIDEST, BLOCK, TILE = 8, 32, 8  # at least as many as step.c's W, B and TILE
 LINE = 8  # numbers in a line of the cache
-FEASIBLE = 1e-8  # of nearest.c
 
 
 class _Bases(ctypes.Structure):
@@ -65,14 +78,14 @@ def load_steps(kernels: KernelLibrary) -> ctypes.CDLL | None:
     library = kernels.load_source(*SOURCES)
     if library is not None:
         library.look.argtypes, library.look.restype = (c_void_p,) * 3, c_double
-        library.model.argtypes = (*(c_void_p,) * 3, *(c_double,) * 3, *(c_void_p,) * 3)
+        library.model.restype, library.model.argtypes = None, (*(c_void_p,) * 3, *(c_double,) * 3, *(c_void_p,) * 3)
         solve = (*(c_void_p,) * 3, c_double, c_double, c_int, c_void_p, c_double, c_double, c_int, c_void_p, c_void_p)
         library.solve.argtypes = solve
     return library
 
 
 class CompiledSteps:
-    """What ``PlainSteps`` does.
+    """Steps whose numbers are computed by step.c; see ``Steps``.
 
     Args:
         motion: The transcription.
@@ -88,25 +101,25 @@ class CompiledSteps:
         self._points, self._m, self._nx = len(motion.grid.s), motion.stage.values.tape.outputs[0], motion.nx
         self._motion = self._describe(motion, bounds, thin)
         self._at = ctypes.addressof(self._motion)
+        self._plain = PlainSteps(motion, bounds, thin)
 
     def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate what is minimised, residuals (K, m) and their worst violation."""
+        """Evaluate; see ``Steps``."""
         g = np.empty((self._m, self._points))
         cost = self._look(self._at, address_of(x), address_of(g))
         return cost, g.T, self._motion.violation
 
     def model(self, x: Array, g: Array, near: Near, *, proximal: float, penalty: float) -> "CompiledModel":
-        """Lay out the quadratic model near x, where residuals are g."""
-        held, missed = np.empty((self._m, self._points), bool), np.ascontiguousarray(near.missed.T)
+        """Model the motion; see ``Steps``."""
+        held, missed = np.zeros((self._m, self._points), bool), np.ascontiguousarray(near.missed.T)
         before = None if near.multipliers is None else np.ascontiguousarray(near.multipliers.T)
         addresses = address_of(missed), None if before is None else address_of(before), address_of(held)
         self._motion.violation = near.violation
-        convex = self._model(self._at, address_of(x), address_of(g.T), proximal, near.near, near.leap, *addresses)
-        return CompiledModel(self, g, held.T, penalty * near.violation + USED, bool(convex))
+        self._model(self._at, address_of(x), address_of(g.T), proximal, near.near, near.leap, *addresses)
+        plain = partial(self._plain.model, x, g, near, proximal=proximal, penalty=penalty)
+        return CompiledModel(self, plain, g, held.T, penalty * near.violation + USED)
 
-    def solve(
-        self, model: "CompiledModel", box: Array, *, warm: Array | None = None, relax: bool = False
-    ) -> Step | None:
+    def solve(self, model: "CompiledModel", box: Array, warm: Array | None, *, relax: bool) -> Step | None:
         """Solve the programme of the model that was laid out last."""
         dx, multipliers = np.empty(self._nx), np.zeros((self._m, self._points))
         before = None if warm is None else np.ascontiguousarray(warm.T)
@@ -181,7 +194,7 @@ class CompiledSteps:
             "gradient": nx,
             "hessian": nx * stride,
             "factor": nx * stride,
-            "scratch": max(size + (width + 1) * self._m * TILE + stride, criterion),
+            "scratch": max(size + (width + 1) * self._m * TILE + stride, criterion) + WIDEST,
             "where": size,
             "first": size,
         }
@@ -211,12 +224,25 @@ def _aligned(size: int) -> Array:
     return array[first : first + size]
 
 
+@dataclass(frozen=True)
 class CompiledModel:
-    """What ``QuadraticModel`` is."""
+    """The quadratic programmes that step.c has laid out; see ``Model``.
 
-    def __init__(self, steps: CompiledSteps, g: Array, held: Mask, slope: float, convex: bool) -> None:
-        self._steps, self.g, self.held, self.slope, self._convex = steps, g, held, slope, convex
+    Attributes:
+        steps: Whose they are.
+        plain: Makes the same model in NumPy.
+        g: Residuals where it is made, shape (K, m).
+        held: Which of them the programmes hold, shape (K, m).
+        slope: Cost of all violations.
+    """
+
+    steps: CompiledSteps
+    plain: Callable[[], Model]
+    g: Array
+    held: Mask
+    slope: float
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box, or None where there is none; see ``QuadraticModel.solve``."""
-        return self._steps.solve(self, box, warm=warm, relax=relax) if self._convex else None
+        """Return the best step within the box; see ``Model``. Where nearest.c finds none, DAQP has its turn."""
+        found = self.steps.solve(self, box, warm, relax=relax)
+        return self.plain().solve(box, warm=warm, relax=relax) if found is None else found

@@ -1,6 +1,6 @@
-/* The point of a polyhedron that is nearest to -f, by the dual method of Goldfarb and Idnani (Math. Programming 27, 1983):
-minimise x x / 2 + f x subject to low <= a x <= high for every row a. It takes DAQP's place; what differs is that rows which
-are taken to be active at first are so at once, and that it is compiled for the machine. vectors.h comes first. */
+/* The point of a polyhedron that is nearest to -f, by the dual method of Goldfarb and Idnani (Mathematical Programming
+27, 1983): minimise x x / 2 + f x subject to low <= a x <= high for every row a. It takes DAQP's place. Rows that are
+taken to be active at first are so at once, where DAQP adds one after the other. vectors.h comes first. */
 
 #define EACH(i, from, to) for (long i = (from); i < (to); i++)
 #define B (4 * W) /* rows that lie side by side */
@@ -36,7 +36,8 @@ typedef struct {
 
 I double *entry(const polyhedron *p, long row, long i) { return p->rows + (row / B) * p->dim * B + i * B + row % B; }
 
-typedef struct { /* active rows a, with signs so that a x <= b, and the factor of their products, whose diagonal is inverted */
+/* Active rows a, with signs so that a x <= b, and the factor of their products, whose diagonal is inverted. */
+typedef struct {
   long dim, stride, count;
   double *a, *factor, *b, *sign, *multiplier, *product, *share;
   int *row;
@@ -53,8 +54,8 @@ static void backward(const working *s, double *y) {
   }
 }
 
-/* Put a row that would come next into the basis of the active ones: its square without them is returned, `share` are its
-coefficients in them. */
+/* Express a row that would come next by the active ones: `share` are its coefficients in them, and the square of what
+they leave of it is returned. */
 static double project(working *s, const double *a) {
   EACH(i, 0, s->count) s->product[i] = dot(s->a + i * s->stride, a, s->dim);
   forward(s, s->product);
@@ -77,7 +78,8 @@ static void release(working *s, long k) {
   EACH(i, k, s->count) { /* rows move up; rotations of neighbouring columns make the factor triangular again */
     memcpy(s->a + i * stride, s->a + (i + 1) * stride, s->dim * sizeof(double));
     memcpy(s->factor + i * stride, s->factor + (i + 1) * stride, (i + 2) * sizeof(double));
-    s->b[i] = s->b[i + 1], s->sign[i] = s->sign[i + 1], s->multiplier[i] = s->multiplier[i + 1], s->row[i] = s->row[i + 1];
+    s->b[i] = s->b[i + 1], s->sign[i] = s->sign[i + 1];
+    s->multiplier[i] = s->multiplier[i + 1], s->row[i] = s->row[i + 1];
   }
   EACH(i, k, s->count) {
     double *f = s->factor + i * stride, last = 1 / f[i + 1], size = sqrt(f[i] * f[i] + last * last);
@@ -104,8 +106,8 @@ static void begin(const polyhedron *p, working *set, const int *first, long coun
   }
 }
 
-/* Find x and the multipliers of what is active, without what would have to pull; after many changes more exactly than they
-are known. */
+/* Find x and the multipliers of what is active, without what would have to pull; more exactly than many changes leave
+them. */
 static void settle(const polyhedron *p, working *set, const double *f, double *x) {
   for (long before = -1; before != set->count;) {
     before = set->count;
@@ -182,8 +184,9 @@ static int nearest(const polyhedron *p, const double *f, const int *first, long 
   long dim = p->dim, stride = p->stride;
   double *next = p->scratch;
   set->dim = dim, set->stride = stride, set->count = 0;
-  set->b = next, set->sign = set->b + stride, set->multiplier = set->sign + stride, set->product = set->multiplier + stride;
-  set->share = set->product + stride, set->a = set->share + stride, set->factor = set->a + dim * stride;
+  set->b = next, set->sign = set->b + stride, set->multiplier = set->sign + stride;
+  set->product = set->multiplier + stride, set->share = set->product + stride;
+  set->a = set->share + stride, set->factor = set->a + dim * stride;
   set->row = p->active;
   measure(p);
   begin(p, set, first, n_first);

@@ -1,8 +1,8 @@
-/* One step of the sequential quadratic programme of one motion: what transcription.py and quadratic.py say in NumPy, over
-the same compiled kernels.
+/* One step of the sequential quadratic programme of one motion: what transcription.py and quadratic.py say in NumPy,
+over the same compiled kernels.
 
-Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n joints,
-nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
+Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n
+joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
 
 #define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
 
@@ -36,7 +36,7 @@ typedef struct {
 
 /* ---- The motion of variables x: control points, states, objective (Transcription) ---- */
 
-/* The two control points beside an end, from its state, and how they move with the rate (trajectory/boundary, slopes). */
+/* The control points at an end, from its state, and how they move with the rate (trajectory/boundary.py, slopes.py). */
 static void end(motion *s, const double *q, const double *dq, const double *ddq, double sign, long last, long step) {
   long inner = last + step, edge = step > 0 ? 0 : s->path - 1;
   double r = s->rates[last], eta = s->eta;
@@ -77,8 +77,9 @@ static void states(const motion *s, const bases *b, double *w) {
     add(w + (b->orders * n + o) * points, s->rates[c], b->rate + (o * s->rate + c) * points, points);
 }
 
-/* Take the gradient in w of residual i at one of `points` phases out of a Jacobian: joints (orders, padded n), then rates. */
-static void gather(const motion *s, long orders, const double *jacobian, long count, long i, long points, long k, double *J) {
+/* Take the gradient in w of residual i at phase k out of a Jacobian: joints (orders, padded n), then rates. */
+static void gather(const motion *s, long orders, const double *jacobian, long count, long i, long points, long k,
+                   double *J) {
   long n = s->n, stride = padded(n);
   EACH(o, 0, orders) EACH(j, 0, n) J[o * stride + j] = jacobian[((o * n + j) * count + i) * points + k];
   EACH(o, 0, orders - 1) J[orders * stride + o] = jacobian[((orders * n + o) * count + i) * points + k];
@@ -117,8 +118,10 @@ static void chain(const motion *s, const bases *b, long k, const double *J, doub
 /* The criterion's integral; its gradient and Gauss-Newton Hessian are added where they are wanted. */
 static double criterion(motion *s, int derivatives) {
   const bases *b = &s->nodes;
-  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points, nx = s->nx, stride = s->stride;
-  double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points, *rows = jacobian + width * count * points;
+  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points;
+  long nx = s->nx, stride = s->stride;
+  double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points;
+  double *rows = jacobian + width * count * points;
   double J[width + b->orders * W], scaled[count], cost = 0;
   memset(J, 0, sizeof J);
   states(s, b, w);
@@ -168,17 +171,24 @@ static double duration(motion *s, const double *log, int derivatives) {
     EACH(i, 0, s->rate) slope[i] = basis[i] * s->rates[i];
     add(s->gradient + split, -weight * inverse, slope, s->rate);
     EACH(i, 0, s->rate) if (slope[i] != 0)
-      add(s->hessian + (split + i) * stride + split + i, 2 * weight * inverse * inverse * slope[i], slope + i, s->rate - i);
+      add(s->hessian + (split + i) * stride + split + i, 2 * weight * inverse * inverse * slope[i], slope + i,
+          s->rate - i);
   }
   return cost;
 }
 
-static double worst(motion *s, const double *g) {
+/* How far outside a residual is: number i of those at all points. */
+I double outside(const motion *s, const double *g, long i) {
+  double over = g[i] - s->upper[i], under = s->lower[i] - g[i];
+  return over > under ? over : under;
+}
+
+static double worst(const motion *s, const double *g) {
   double found = 0;
   EACH(i, 0, s->m * s->grid.points) {
-    double excess = g[i] - s->upper[i] > s->lower[i] - g[i] ? g[i] - s->upper[i] : s->lower[i] - g[i];
-    if (!(excess <= found)) found = excess;
-    if (found != found) return INFINITY;
+    double excess = outside(s, g, i);
+    if (excess != excess) return INFINITY;
+    if (excess > found) found = excess;
   }
   return found;
 }
@@ -227,10 +237,7 @@ static void whiten(const motion *s, double *block, long from) {
   }
 }
 
-/* How far outside residual i is at point k, and whether it is a crest along the motion, beside one, or in the thin grid. */
-I double outside(const motion *s, const double *g, long at) {
-  return g[at] - s->upper[at] > s->lower[at] - g[at] ? g[at] - s->upper[at] : s->lower[at] - g[at];
-}
+/* Mark crests along the motion, what is beside them, and the thin grid. */
 static void crest(const motion *s, const double *excess, unsigned char *wide) {
   long last = s->grid.points - 1;
   EACH(k, 0, last + 1) wide[k] = k % s->thin == 0;
@@ -249,21 +256,26 @@ static double leap(const motion *s, long k, const double *J, double step) {
   return reach;
 }
 
-/* Lay out the model at x, whose residuals are g: residuals are held that are nearer to a bound than `near`, that may leap
-over it with a step of `step`, that were `missed`, or that had multipliers. `held` says which. 0: the Hessian is not positive. */
-int model(motion *s, const double *x, const double *g, double proximal, double near, double step,
-          const unsigned char *missed, const double *multipliers, unsigned char *held) {
-  long nx = s->nx, n = s->n, points = s->grid.points, width = s->grid.orders * n + s->grid.orders - 1, m = s->m;
+/* Evaluate the motion at x, and gradient and factor of its objective. 0: the Hessian is not positive. */
+static int objective(motion *s, const double *x, double proximal) {
   unpack(s, x);
   states(s, &s->grid, s->w);
-  memset(s->gradient, 0, nx * sizeof(double));
-  memset(s->hessian, 0, nx * s->stride * sizeof(double));
-  duration(s, x + nx - s->rate, 1);
+  memset(s->gradient, 0, s->nx * sizeof(double));
+  memset(s->hessian, 0, s->nx * s->stride * sizeof(double));
+  duration(s, x + s->nx - s->rate, 1);
   if (s->criterion) criterion(s, 1);
-  if (!factor(s, proximal)) return 0;
+  return factor(s, proximal);
+}
 
-  double *excess = s->scratch, *values = excess + m * points, *jacobian = values + m * TILE, *row = jacobian + width * m * TILE;
-  double J[width + s->grid.orders * W];
+/* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, that may leap
+over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
+void model(motion *s, const double *x, const double *g, double proximal, double near, double step,
+           const unsigned char *missed, const double *multipliers, unsigned char *held) {
+  long nx = s->nx, points = s->grid.points, width = s->grid.orders * s->n + s->grid.orders - 1, m = s->m;
+  polyhedron *p = &s->programme;
+  if (!(p->count = objective(s, x, proximal))) return;
+  double *excess = s->scratch, *values = excess + m * points, *jacobian = values + m * TILE;
+  double *row = jacobian + width * m * TILE, J[width + s->grid.orders * W];
   memset(J, 0, sizeof J);
   EACH(i, 0, m * points) excess[i] = outside(s, g, i);
   EACH(i, 0, m) crest(s, excess + i * points, held + i * points);
@@ -271,7 +283,6 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
     held[i] = (held[i] && excess[i] > -near) || missed[i] || (multipliers && multipliers[i] != 0);
 
   long count = nx + 1;
-  polyhedron *p = &s->programme;
   memset(p->rows, 0, (count + B) / B * count * B * sizeof(double));
   EACH(i, 0, nx) *entry(p, i, i) = 1;
   for (long first = 0; first < points; first += TILE) {
@@ -292,7 +303,6 @@ int model(motion *s, const double *x, const double *g, double proximal, double n
   }
   for (long first = 0; first < count; first += B) whiten(s, entry(p, first, 0), first + B <= nx ? first : 0);
   s->held = count - nx - 1, p->count = count;
-  return 1;
 }
 
 /* How far the rows may go, and what the elastic variable adds to them. */
@@ -312,15 +322,16 @@ static void bound(motion *s, const double *g, const double *box, double softness
   }
 }
 
-/* Solve the programme that `model` has laid out; 0 where it has no solution, or none in so many changes.
+/* Solve the programme that `model` has laid out; 0 where there is none, it has no solution, or not in so many changes.
 
-The step is within the box, (nx,), and costs `slope` times the share of the violations that it leaves, which all rows may
-use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, if they are more than `least`;
+The step is within the box, (nx,), and costs `slope` times the share of the violations that it leaves, which all rows
+may use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, if they are more than `least`;
 `multipliers` are those of the solution. */
 int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
           double least, double feasible, int changes, double *dx, double *multipliers) {
   long nx = s->nx, dim = nx + 1, stride = s->stride, count = 0;
   double f[dim], x[dim];
+  if (!s->programme.count) return 0;
   bound(s, g, box, softness, relax);
   EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * stride, f, i)) * s->factor[i * stride + i];
   f[nx] = slope / softness;
@@ -330,7 +341,8 @@ int solve(motion *s, const double *g, const double *box, double slope, double so
   }
   working set;
   if (!nearest(&s->programme, f, s->first, count, feasible, changes, x, &set)) return 0;
-  EACH(i, 0, set.count) if (set.row[i] >= dim) multipliers[s->where[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
+  EACH(i, 0, set.count) if (set.row[i] >= dim)
+    multipliers[s->where[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
   s->gain = -dot(f, x, nx) - 0.5 * dot(x, x, nx);
   s->left = x[nx] / softness;
   memcpy(dx, x, nx * sizeof(double));

@@ -7,6 +7,7 @@ that a violation of 1e-3 means about the same everywhere.
 """
 
 from collections.abc import Callable
+from ctypes import CDLL
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -60,7 +61,7 @@ class ResidualKernels:
         jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
         criterion: What is minimised beside the time, or None.
         residuals: Kernel of ``cnpgen.refine.solver.criterion.criterion_residuals``, or None.
-        steps: Compiled code of whole steps, or None where these are NumPy's.
+        steps: Library of ``cnpgen.refine.solver.compiled``, or None where steps are in NumPy and DAQP.
     """
 
     spec: TrajectorySpec
@@ -68,7 +69,7 @@ class ResidualKernels:
     jacobian: Kernel
     criterion: Criterion | None = None
     residuals: Kernel | None = None
-    steps: Any = None
+    steps: CDLL | None = None
 
 
 class Transcription:
