@@ -1,4 +1,4 @@
-"""Steps in compiled code, ``step.c`` and ``nearest.c``: those of NumPy and DAQP but for rounding, several times as fast."""
+"""Steps in compiled code, ``step.c`` and ``nearest.c``: those of NumPy and DAQP but for rounding, and much faster."""
 
 import ctypes
 from collections.abc import Callable
