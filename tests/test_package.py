@@ -58,6 +58,9 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
             if path.is_file():
                 assert f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" in wheel.namelist()
     assert "cnpgen/py.typed" in wheel.namelist()
+    sources = [path.relative_to(ROOT).as_posix() for path in (ROOT / "cnpgen").rglob("*.[ch]")]
+    assert "cnpgen/refine/solver/step.c" in sources
+    assert set(sources) <= set(wheel.namelist())
 
 
 def test_the_wheel_carries_nothing_that_was_left_lying_about(wheel: zipfile.ZipFile) -> None:

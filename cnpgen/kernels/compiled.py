@@ -10,7 +10,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 
 from cnpgen.errors import MachineError
 from cnpgen.kernels.cache import LIBRARIES, is_trusted, keep_from_others, make_private, require_trusted, warm_folder
-from cnpgen.kernels.emit import VECTORS, emit
+from cnpgen.kernels.emit import VECTORS, emit, prelude
 from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
@@ -47,6 +47,11 @@ class CompiledKernel(Kernel):
             strides = _array_type(ctypes.c_long, len(arguments))(*[argument.strides[0] // 8 for argument in arguments])
             self._function(ctypes.c_long(n), _pointers(arguments), strides, _pointers(results))
         return results
+
+    @property
+    def address(self) -> int | None:
+        """Where its machine code begins; see ``Kernel``."""
+        return ctypes.cast(self._function, ctypes.c_void_p).value
 
 
 class CompiledGridKernel(GridKernel):
@@ -81,7 +86,7 @@ def _distances(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_long]":
 
 
 def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
-    found: ctypes.Array[ctypes.c_void_p] = _array_type(ctypes.c_void_p, len(arrays))(*map(_address, arrays))
+    found: ctypes.Array[ctypes.c_void_p] = _array_type(ctypes.c_void_p, len(arrays))(*map(address_of, arrays))
     return found
 
 
@@ -91,7 +96,8 @@ def _array_type(kind: Any, count: int) -> Any:
     return kind * count
 
 
-def _address(array: Any) -> int:
+def address_of(array: Any) -> int:
+    """Return where an array's numbers begin."""
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # takes a third of the time of what follows
     except (TypeError, ValueError):  # read-only, strided, or empty
@@ -201,11 +207,15 @@ def _emitter_digest() -> str:
 
 def library_stem(tape: Tape, compiler: str) -> str:
     """How the file name of a tape's library begins: with everything that determines its content."""
-    identity = hashlib.sha256(tape.to_bytes())
-    flags = (*FLAGS, optimisation(tape), *vector_flags(), *shlex.split(compiler)[1:])
+    return _stem(tape.name, tape.to_bytes(), optimisation(tape), compiler)
+
+
+def _stem(name: str, content: bytes, level: str, compiler: str) -> str:
+    identity = hashlib.sha256(content)
+    flags = (*FLAGS, level, *vector_flags(), *shlex.split(compiler)[1:])
     for text in (*flags, compiler_version(compiler), target(), _emitter_digest()):
         identity.update(text.encode() + b"\0")
-    return f"{tape.name}-{identity.hexdigest()[:24]}"
+    return f"{name}-{identity.hexdigest()[:24]}"
 
 
 def find_library(folder: Path, stem: str) -> Path | None:
@@ -227,7 +237,10 @@ def find_compiled(tape: Tape, cache_folder: Path) -> Path | None:
     Raises:
         MachineError: There is no working compiler, or the cache folder cannot be read or may be changed by others.
     """
-    stem = library_stem(tape, require_compiler())
+    return _find(library_stem(tape, require_compiler()), cache_folder)
+
+
+def _find(stem: str, cache_folder: Path) -> Path | None:
     try:
         found = (find_library(folder / LIBRARIES, stem) for folder in require_trusted(cache_folder))
         return next((library for library in found if library), None)
@@ -241,18 +254,36 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     Raises:
         MachineError: There is no working compiler, or the cache folder cannot be written or may be changed by others.
     """
-    if found := find_compiled(tape, cache_folder):
-        return found
-    compiler = require_compiler()
-    libraries, stem = cache_folder / LIBRARIES, library_stem(tape, compiler)
+    stem = library_stem(tape, require_compiler())
+    return _find(stem, cache_folder) or _compile(stem, lambda: emit(tape), optimisation(tape), cache_folder)
+
+
+def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
+    """Return the library of C source that was written by hand, over the vectors of double that kernels use.
+
+    Args:
+        paths: Its files in the order in which they are read, as one; the last one names the library.
+        cache_folder: Where libraries are kept.
+
+    Raises:
+        MachineError: As of ``compile_tape``.
+    """
+    text, level = "".join([prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]), "-O3"
+    stem = _stem(paths[-1].stem, text.encode(), level, require_compiler())
+    return _find(stem, cache_folder) or _compile(stem, lambda: text, level, cache_folder)
+
+
+def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
+    """Compile C source into the cache."""
+    libraries = cache_folder / LIBRARIES
     try:
         _announce(cache_folder)
         make_private(libraries)
         require_trusted(cache_folder)
         with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
-            source, built = Path(folder) / f"{tape.name}.c", Path(folder) / "kernel.so"
-            source.write_text(emit(tape), encoding="utf-8")
-            _run_compiler(compiler, optimisation(tape), source, built)
+            written, built = Path(folder) / f"{stem.rpartition('-')[0]}.c", Path(folder) / "kernel.so"
+            written.write_text(source(), encoding="utf-8")
+            _run_compiler(require_compiler(), level, written, built)
             keep_from_others(built)
             return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
     except OSError as error:

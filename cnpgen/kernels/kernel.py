@@ -21,6 +21,11 @@ class Kernel(ABC):
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
 
+    @property
+    def address(self) -> int | None:
+        """Where its machine code begins, for other compiled code; None where there is none."""
+        return None
+
     @abstractmethod
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate every lane.

@@ -1,5 +1,6 @@
 """Where kernels come from: SX builders, a cache of tapes and compiled libraries, and the backend that runs them."""
 
+import ctypes
 import hashlib
 import inspect
 import json
@@ -23,7 +24,13 @@ from cnpgen.kernels.cache import (
     require_trusted,
     usable_folder,
 )
-from cnpgen.kernels.compiled import CompiledGridKernel, CompiledKernel, compile_tape, require_compiler
+from cnpgen.kernels.compiled import (
+    CompiledGridKernel,
+    CompiledKernel,
+    compile_source,
+    compile_tape,
+    require_compiler,
+)
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
@@ -108,6 +115,14 @@ class KernelLibrary:
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
+
+    def load_source(self, *paths: Path) -> ctypes.CDLL | None:
+        """Return the library of C source that was written by hand, or None where kernels are not compiled.
+
+        Args:
+            paths: Its files, as of ``compile_source``.
+        """
+        return ctypes.CDLL(str(compile_source(paths, self.cache_folder))) if self.backend == "compiled" else None
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
         """Return the operations of the SX function that ``builder`` builds; nothing is compiled.

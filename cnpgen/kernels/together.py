@@ -31,6 +31,11 @@ class PendingKernel(Kernel):
         """Evaluate every lane; see ``Kernel``."""
         return self._compiled(*arguments)
 
+    @property
+    def address(self) -> int | None:
+        """Where its machine code begins, once it is compiled; see ``Kernel``."""
+        return self._compiled.address
+
 
 class Compilers:
     """Compiles tapes in the background, equal ones once; at the end of its ``with`` block all of them are compiled.

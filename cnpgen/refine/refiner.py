@@ -13,6 +13,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.fine import FineCheck
 from cnpgen.refine.solver import starts
 from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate, Tightening
+from cnpgen.refine.solver.compiled import load_steps
 from cnpgen.refine.solver.criterion import Criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
@@ -114,7 +115,12 @@ class Refiner:
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
         self.stage = ResidualKernels(
-            self.spec, kernels.load(stage_values), kernels.load(stage_jacobian), criterion, residuals
+            self.spec,
+            kernels.load(stage_values),
+            kernels.load(stage_jacobian),
+            criterion,
+            residuals,
+            load_steps(kernels),
         )
         self.passes = default_passes(problem, settings) if passes is None else passes
         self.check = FineCheck(problem, world, self.stage)

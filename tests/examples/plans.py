@@ -10,7 +10,8 @@ import pinocchio as pin
 from scipy.integrate import simpson
 from scipy.interpolate import BSpline
 
-from cnpgen.judges.plans import Verdict, judge
+from cnpgen.judges.plans import Verdict
+from cnpgen.judges.plans.judge import Judge
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
@@ -35,10 +36,9 @@ class Plan:
     start_xyz: np.ndarray
     goal_xyz: np.ndarray
 
-    def judged(self, **options: Any) -> Verdict:
-        (verdict,) = judge(
-            self.problem, self.robot, self.motion, self.boundary, self.start_xyz, self.goal_xyz, **options
-        )
+    def judged(self, *, brief: bool = False, **options: Any) -> Verdict:
+        given = self.motion, self.boundary, self.start_xyz, self.goal_xyz
+        (verdict,) = Judge(self.problem, self.robot, **options)(*given, brief=brief)
         return verdict
 
     def changed(self, *, path: np.ndarray | None = None, rate: np.ndarray | None = None) -> "Plan":

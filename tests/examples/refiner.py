@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from cnpgen.judges.plans import Verdict, judge
 from cnpgen.kernels.compiled import find_compiler
@@ -18,6 +19,8 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.state import World
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
 
 @cache

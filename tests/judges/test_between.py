@@ -43,13 +43,20 @@ def test_a_peak_between_any_two_moments_of_a_grid_is_found() -> None:
     assert (found, row, s) == (pytest.approx(2, abs=ROUGH), 0, pytest.approx(at, abs=0.1))
 
 
+@pytest.mark.parametrize("least", [-np.inf, 1.0])
 @pytest.mark.parametrize("top", [1 + 2 * CLOSE, 1 - 1e-9])
-def test_whether_a_peak_is_above_1_is_known_exactly(top: float) -> None:
+def test_whether_a_peak_is_above_1_is_known_exactly(top: float, least: float) -> None:
     at = 1 / np.pi
     rows = np.array([[[top - at**2, top - at**2 + at, top - (1 - at) ** 2]]])
-    found, _, _ = largest(rows, np.array([0.0, 1.0]))
-    assert top - CLOSE <= found <= top
+    found, _, _ = largest(rows, np.array([0.0, 1.0]), least=least)
+    assert found <= top
+    assert found >= top - CLOSE or top <= least
     assert (found > 1) == (top > 1)
+
+
+def test_what_is_proven_to_be_small_is_not_looked_into() -> None:
+    rows = np.array([[[0.0, 0.9, 0.0]]])  # never above 0.45
+    assert largest(rows, np.array([0.0, 1.0]), (0.1, 0, 0.2), least=1.0) == (0.1, 0, 0.2)
 
 
 def test_a_constant_is_its_own_largest_value() -> None:

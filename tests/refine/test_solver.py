@@ -13,11 +13,12 @@ from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Pass, Refiner
-from cnpgen.refine.solver import sqp
+from cnpgen.refine.solver import compiled, quadratic, sqp
 from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.compiled import CompiledSteps
 from cnpgen.refine.solver.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.quadratic import QuadraticModel, choose
+from cnpgen.refine.solver.quadratic import Near, PlainSteps, Steps
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import Settings, minimise
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
@@ -30,7 +31,7 @@ from cnpgen.world.state import World
 from tests.conftest import some
 from tests.examples.constraints import TipSpeed
 from tests.examples.plans import PROBLEMS, Plan, load, raised
-from tests.examples.refiner import library, refine, refiner, refiner_of, task, tops, verdict
+from tests.examples.refiner import library, needs_compiler, refine, refiner, refiner_of, task, tops, verdict
 
 LABELS = ("hit", "replan", "transport")
 
@@ -426,14 +427,20 @@ class CountingJury(Jury):
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.3])
-def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radius: float) -> None:
+@pytest.mark.parametrize("kind", [PlainSteps, pytest.param(CompiledSteps, marks=needs_compiler)])
+def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(
+    kind: type[Steps], radius: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (quadratic, compiled):  # rows are long: what is broken by 1e-6 of their length shows
+        monkeypatch.setattr(module, "FEASIBLE", 1e-9)
     plan, tool = load("hit"), refiner("airhockey")
     motion = tool.transcription(task(plan), tool.passes.first)
     bounds = tool.bounds(task(plan), tool.passes.first, motion.end_residuals())
-    at = motion.evaluate(tool.straight(task(plan)))
-    model = QuadraticModel(motion, at, bounds, bounds.violation(at.g), proximal=0.02, penalty=2.0)
-    held = choose(at.g, bounds, thin=6, near=0.4, leaps=motion.leaps(at, 0.45))
-    step = model.solve(held, np.full(motion.nx, radius))
+    at, steps = motion.evaluate(tool.straight(task(plan))), kind(motion, bounds, 6)
+    near = Near(bounds.violation(at.g), near=0.4, leap=0.45, missed=np.zeros(at.g.shape, bool), multipliers=None)
+    model = steps.model(at.x, steps.value(at.x)[1], near, proximal=0.02, penalty=2.0)
+    held, box = model.held, np.full(motion.nx, radius)
+    step = model.solve(box)
     assert step is not None
 
     k, which = np.nonzero(held)
@@ -453,9 +460,9 @@ def test_the_step_of_a_quadratic_programme_meets_the_optimality_conditions(radiu
     assert np.all(slope[~inside] * np.sign(step.dx[~inside]) < 1e-6)
     assert inside.any()
     assert not inside.all()
-    again = model.solve(held, np.full(motion.nx, radius), warm=step.multipliers)
+    again = model.solve(box, warm=step.multipliers)
     np.testing.assert_allclose(again.dx, step.dx, atol=1e-6)
-    assert model.solve(held, np.full(motion.nx, radius), relax=True).left <= step.left + 1e-6
+    assert model.solve(box, relax=True).left <= step.left + 1e-6
 
 
 @pytest.mark.slow

@@ -59,19 +59,20 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> Pieces:
     return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq, jerk=third)
 
 
-def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0)) -> Peak:
+def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least: float = -np.inf) -> Peak:
     """Find the largest value of piecewise polynomials to within ``ROUGH``, and whether it is above 1 to ``CLOSE``.
 
     Args:
         rows: Bernstein coefficients of M functions, finite, shape (M, S, d + 1).
         edges: Phases between which they are polynomials, shape (S + 1,).
         known: A value that is attained, as returned.
+        least: What is proven to be no larger than this, at most 1, is not looked into.
 
     Returns:
         ``(value, row, s)``: the largest value that is attained, of which function, at which phase.
     """
     best, *at = known
-    of_row, span = np.nonzero(_worth_halving(rows.max(axis=2), best))
+    of_row, span = np.nonzero(_worth_halving(rows.max(axis=2), best, least))
     pieces, left, width = rows[of_row, span], edges[span], np.diff(edges)[span]
     for _ in range(HALVINGS):
         if not len(pieces):
@@ -83,14 +84,14 @@ def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0)) -> Peak:
             top = int(np.argmax(pieces[:, k]))
             if pieces[top, k] > best:
                 best, *at = float(pieces[top, k]), int(of_row[top]), float(s[top])
-        kept = _worth_halving(pieces.max(axis=1), best)
+        kept = _worth_halving(pieces.max(axis=1), best, least)
         pieces, of_row, left, width = pieces[kept], of_row[kept], left[kept], width[kept]
     return best, int(at[0]), at[1]
 
 
-def _worth_halving(hull: Array, best: float) -> NDArray[np.bool_]:
+def _worth_halving(hull: Array, best: float, least: float) -> NDArray[np.bool_]:
     """Find pieces whose largest coefficients could hide more than is known."""
-    return np.asarray(hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH))
+    return np.asarray((hull > least) & (hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH)))
 
 
 @cache

@@ -89,7 +89,10 @@ class Judge:
     def __call__(
         self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, brief: bool = False
     ) -> list[Verdict]:
-        """Judge N plans; arguments as of ``judge``. A brief verdict has neither metrics nor the paper's rule."""
+        """Judge N plans; arguments as of ``judge``.
+
+        A brief verdict has neither metrics nor the paper's rule, and of joint limits that hold the margins at samples.
+        """
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
         with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
             return [_judge_plan(plan, self._world, self._step, brief=brief) for plan in plans]
@@ -178,15 +181,15 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     if not brief:
         metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
-    margins = [*ends, *_margins(survey(plan.problem, plan.motion, plan.tops, world, samples, table))]
+    margins = [*ends, *_margins(survey(plan.problem, plan.motion, plan.tops, world, samples, table), brief=brief)]
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
-def _margins(survey: Survey) -> list[Margin]:
+def _margins(survey: Survey, *, brief: bool) -> list[Margin]:
     """Measure every constraint, at the samples and between them; the survey's world is moved."""
     pieces, margins = polynomials(survey.motion, jerk=survey.problem.uses_jerk), []
     proven = {
-        id(each): limit_margin(each, survey.world, pieces, survey.samples.s, survey.table)
+        id(each): limit_margin(each, survey.world, pieces, survey.samples.s, survey.table, brief=brief)
         for each in survey.problem.constraint
         if is_proven(each)
     }

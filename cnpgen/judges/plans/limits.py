@@ -26,7 +26,9 @@ def is_proven(constraint: Constraint) -> bool:
     return type(constraint) in _COEFFICIENTS
 
 
-def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, s: Array, table: Array) -> Margin:
+def limit_margin(
+    constraint: Constraint, world: PathWorld, pieces: Pieces, s: Array, table: Array, *, brief: bool
+) -> Margin:
     """Find where a motion comes closest to breaking a joint limit, or breaks it most.
 
     Args:
@@ -35,6 +37,7 @@ def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, s: Ar
         pieces: The motion as polynomials.
         s: Phases of the samples, shape (K,).
         table: Times of the motion at ``table_phases()`` [s].
+        brief: Whether, where the limit is proven to hold, it is enough to know how close samples come to it.
     """
     (condition,) = constraint.measured(cast("World", world))
     allowed = constraint.allowed(condition)
@@ -43,7 +46,8 @@ def limit_margin(constraint: Constraint, world: PathWorld, pieces: Pieces, s: Ar
     sampled = _beyond(np.array(condition.g)[:, None], condition, scale)[:, 0]
     row, k = divmod(int(np.argmax(sampled)), len(s))
     known = float(sampled[row, k]), row, float(s[k])
-    share, row, phase = largest(_beyond(coefficients, condition, scale), pieces.edges, known)
+    least = 1.0 if brief else -np.inf
+    share, row, phase = largest(_beyond(coefficients, condition, scale), pieces.edges, known, least=least)
     low, part = row < len(scale), row % len(scale)
     excess, bound = share * scale[part], (condition.lower if low else condition.upper)[part]
     return Margin(

@@ -1,6 +1,7 @@
 """Collocation grids: phases, spline bases there, and quadrature nodes; everything that no motion changes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,11 @@ class Bases:
     rate: Array
     path_at: Array
     rate_at: Array
+
+    @cached_property
+    def along(self) -> tuple[Array, Array]:
+        """``path`` and ``rate`` with the phases last, shape (orders, C, K) and (orders - 1, R, K)."""
+        return np.ascontiguousarray(self.path.swapaxes(1, 2)), np.ascontiguousarray(self.rate.swapaxes(1, 2))
 
     def states(self, path: Array, rate: Array) -> Array:
         """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K).

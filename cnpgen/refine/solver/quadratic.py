@@ -6,12 +6,13 @@ as long for it as BLAS.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.transcription import Linearisation, Transcription
+from cnpgen.refine.solver.transcription import Linearisation, Transcription, of_last
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -34,11 +35,86 @@ class Step:
         dx: The step, shape (nx,).
         left: Fraction of the violations that it leaves.
         multipliers: Of all residuals, shape (K, m); 0 for those that are not held.
+        gain: By how much it promises to reduce the objective.
     """
 
     dx: Array
     left: float
     multipliers: Array
+    gain: float
+
+
+@dataclass(frozen=True)
+class Near:
+    """Where a quadratic programme is made, and what it must hold there.
+
+    Attributes:
+        violation: Worst violation there.
+        near: Residuals are held at crests that are so near to a bound.
+        leap: No logarithm of the rate changes by more: sharp residuals that may leap over a bound then are held.
+        missed: Residuals that are held anyway, shape (K, m).
+        multipliers: Those of the last step, shape (K, m), or None: what has one is held.
+    """
+
+    violation: float
+    near: float
+    leap: float
+    missed: Mask
+    multipliers: Array | None
+
+
+class Model(Protocol):
+    """The quadratic programmes near a point."""
+
+    @property
+    def held(self) -> Mask:
+        """Which residuals they hold, shape (K, m)."""
+
+    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> "Step | None":
+        """Return the best step within the box, or None where there is none.
+
+        Args:
+            box: Largest change of every variable, shape (nx,).
+            warm: Multipliers, shape (K, m), whose residuals are taken to be active at first; None for none.
+            relax: Whether residuals that are met may be broken, too, as far as the worst violation is left.
+        """
+
+
+class Steps(Protocol):
+    """What sequential quadratic programming asks of a motion within its bounds."""
+
+    def value(self, x: Array) -> tuple[float, Array, float]:
+        """Evaluate what is minimised, residuals (K, m) and their worst violation."""
+
+    def model(self, x: Array, g: Array, near: Near, *, proximal: float, penalty: float) -> Model:
+        """Model the motion near x, where residuals are g; the last one is valid until the next."""
+
+
+class PlainSteps:
+    """Steps in NumPy and DAQP.
+
+    Args:
+        motion: The transcription.
+        bounds: Bounds of its residuals.
+        thin: As of ``choose``.
+    """
+
+    def __init__(self, motion: Transcription, bounds: Bounds, thin: int) -> None:
+        self._motion, self._bounds, self._thin = motion, bounds, thin
+        self._evaluate = of_last(motion.evaluate)  # after a refused step the point is the same
+
+    def value(self, x: Array) -> tuple[float, Array, float]:
+        """Evaluate; see ``Steps``."""
+        cost, g = self._motion.value(x)
+        return cost, g, self._bounds.violation(g)
+
+    def model(self, x: Array, g: Array, near: Near, *, proximal: float, penalty: float) -> "QuadraticModel":
+        """Model the motion; see ``Steps``."""
+        at = self._evaluate(x)
+        leaps = self._motion.leaps(at, near.leap)
+        held = choose(g, self._bounds, thin=self._thin, near=near.near, leaps=leaps) | near.missed
+        held = held if near.multipliers is None else held | (near.multipliers != 0)
+        return QuadraticModel(self._motion, at, self._bounds, held, near.violation, proximal, penalty)
 
 
 @dataclass(frozen=True)
@@ -49,6 +125,7 @@ class QuadraticModel:
         motion: The transcription.
         at: The point.
         bounds: Bounds of the residuals.
+        held: Residuals that the programme holds, shape (K, m).
         violation: Worst violation there.
         proximal: Weight of the proximal term.
         penalty: Cost of the worst violation.
@@ -57,6 +134,7 @@ class QuadraticModel:
     motion: Transcription
     at: Linearisation
     bounds: Bounds
+    held: Mask
     violation: float
     proximal: float
     penalty: float
@@ -65,21 +143,14 @@ class QuadraticModel:
         """Return the change of the objective that a step promises."""
         return float(self.at.gradient @ dx + 0.5 * dx @ self.at.curvature @ dx + 0.5 * self.proximal * dx @ dx)
 
-    def solve(self, held: Mask, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box, or None where there is none.
-
-        Args:
-            held: Residuals that the programme holds, shape (K, m).
-            box: Largest change of every variable, shape (nx,).
-            warm: Multipliers, shape (K, m), whose residuals are taken to be active at first; None for none.
-            relax: Whether residuals that are met may be broken, too, as far as the worst violation is left.
-        """
+    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
+        """Return the best step within the box; see ``Model``."""
         import daqp
 
         nx, unwhiten = self.motion.nx, self._unwhiten
         if unwhiten is None:
             return None
-        k, which = np.nonzero(held)
+        k, which = np.nonzero(self.held)
         rows, low, high = self._rows(k, which, unwhiten, relax=relax)
         sense = np.zeros(nx + 1 + len(k), np.int32)
         if warm is not None:
@@ -100,7 +171,7 @@ class QuadraticModel:
             return None
         multipliers = np.zeros(self.at.g.shape)
         multipliers[k, which] = info["lam"][nx + 1 :]
-        return Step(dx, float(solution[-1]) / SOFTNESS, multipliers)
+        return Step(dx, float(solution[-1]) / SOFTNESS, multipliers, -self.cost(dx))
 
     @cached_property
     def _unwhiten(self) -> Array | None:

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.quadratic import Mask, QuadraticModel, Step, choose, crests
-from cnpgen.refine.solver.transcription import Linearisation, Transcription
+from cnpgen.refine.solver.compiled import CompiledSteps
+from cnpgen.refine.solver.quadratic import Mask, Model, Near, PlainSteps, Step, Steps, crests
+from cnpgen.refine.solver.transcription import Transcription
 
 Array = NDArray[np.float64]
 RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
@@ -118,6 +119,11 @@ def _cheaper(one: Result | None, other: Result) -> Result:
     return other if one is None or other.cost < one.cost else one
 
 
+def steps_of(motion: Transcription, bounds: Bounds, thin: int) -> Steps:
+    """Return the steps of a motion, compiled where its kernels are."""
+    return PlainSteps(motion, bounds, thin) if motion.stage.steps is None else CompiledSteps(motion, bounds, thin)
+
+
 class _Descent:
     """An iterate and what is known for the next step.
 
@@ -132,19 +138,19 @@ class _Descent:
     landing = False
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
-        at = motion.evaluate(x)
-        self._at: Linearisation | None = at
-        self.x, self.cost, self.violation = x, at.cost, bounds.violation(at.g)
+        self._steps = steps_of(motion, bounds, settings.thin)
+        self.x = x
+        self.cost, self._g, self.violation = self._steps.value(x)
         self.ended = not self.violation < settings.far
         self._violations = [self.violation]
-        self._motion, self._bounds, self._settings = motion, bounds, settings
+        self._bounds, self._settings = bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
         self._radius, self._funnel, self._penalty = settings.radius, settings.funnel, settings.penalty
         self._length = LARGEST  # of the last step, in the same norm
         self._multipliers: Array | None = None
         self._settled = False
-        self._missed = np.zeros(at.g.shape, bool)  # residuals that a rejected step broke unseen
+        self._missed = np.zeros(self._g.shape, bool)  # residuals that a rejected step broke unseen
 
     def result(self, iterations: int) -> Result:
         """Return where the iteration is."""
@@ -152,16 +158,16 @@ class _Descent:
 
     def advance(self) -> None:
         """Try a step: take it, or know better for the next one."""
-        at = self._at = self._at or self._motion.evaluate(self.x)
-        held = self._held(at)
         settings = self._settings
         proximal = SHORTEST if self.landing else LANDING if self._settled else settings.proximal
-        model = QuadraticModel(self._motion, at, self._bounds, self.violation, proximal, self._penalty)
-        step = self._propose(model, held)
+        near = next(near for length, near in NEAR if self._length > length)
+        where = Near(self.violation, near, LEAP * self._length, self._missed, self._multipliers)
+        model = self._steps.model(self.x, self._g, where, proximal=proximal, penalty=self._penalty)
+        step = self._propose(model)
         if step is None:
             self._radius *= 0.25
         else:
-            self._try(model, step, held)
+            self._try(step, model.held)
         self._violations.append(self.violation)
         self.ended |= self._radius < SMALLEST or self._is_stuck()
 
@@ -171,33 +177,25 @@ class _Descent:
         least, enough = min(before, default=0.0), self._settings.violation_tolerance
         return least > enough and min(recent) > max(PROGRESS * least, enough)
 
-    def _held(self, at: Linearisation) -> Mask:
-        """Choose the residuals of the next quadratic programme."""
-        near = next(near for length, near in NEAR if self._length > length)
-        leaps = self._motion.leaps(at, LEAP * self._length)
-        held = choose(at.g, self._bounds, thin=self._settings.thin, near=near, leaps=leaps) | self._missed
-        return held if self._multipliers is None else held | (self._multipliers != 0)
-
-    def _propose(self, model: QuadraticModel, held: Mask) -> Step | None:
+    def _propose(self, model: Model) -> Step | None:
         """Solve the quadratic programme, again in other ways where that helps little."""
         box = self._radius * self._scale
-        step = model.solve(held, box, warm=self._multipliers)
+        step = model.solve(box, warm=self._multipliers)
         if self.violation > self._settings.violation_tolerance and (step is None or step.left > STUCK):
-            relaxed = model.solve(held, box, relax=True)
+            relaxed = model.solve(box, relax=True)
             if relaxed is not None and relaxed.left > STUCK and self._penalty < self.cost:
                 self._penalty = HEAVY * self.cost
             return relaxed or step
         if step is None and self._multipliers is not None:
-            return model.solve(held, box)
+            return model.solve(box)
         return step
 
-    def _try(self, model: QuadraticModel, step: Step, held: Mask) -> None:
+    def _try(self, step: Step, held: Mask) -> None:
         """Take a step if it holds what it promised."""
         settings = self._settings
         x = self.x + step.dx
-        cost, g = self._motion.value(x)
-        violation = self._bounds.violation(g)
-        gain = -model.cost(step.dx)
+        cost, g, violation = self._steps.value(x)
+        gain = step.gain
         predicted = gain + self._penalty * self.violation * (1 - step.left)
         reduction = self.cost - cost + self._penalty * (self.violation - violation)
         cheaper = violation <= self._funnel and self.cost - cost > WORTH * gain > 0
@@ -212,7 +210,7 @@ class _Descent:
                 self._radius *= 0.5
             self._settled = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
             self.ended = (self._settled or self.landing) and violation < settings.violation_tolerance
-            self._at, self.x, self.cost, self.violation, self._length = None, x, cost, violation, size
+            self.x, self.cost, self._g, self.violation, self._length = x, cost, g, violation, size
             self._missed[:] = False
         else:
             self._learn(self._bounds.excess(g), held, size)

@@ -7,6 +7,7 @@ that a violation of 1e-3 means about the same everywhere.
 """
 
 from collections.abc import Callable
+from ctypes import CDLL
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -60,6 +61,7 @@ class ResidualKernels:
         jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
         criterion: What is minimised beside the time, or None.
         residuals: Kernel of ``cnpgen.refine.solver.criterion.criterion_residuals``, or None.
+        steps: Library of ``cnpgen.refine.solver.compiled``, or None where steps are in NumPy and DAQP.
     """
 
     spec: TrajectorySpec
@@ -67,6 +69,7 @@ class ResidualKernels:
     jacobian: Kernel
     criterion: Criterion | None = None
     residuals: Kernel | None = None
+    steps: CDLL | None = None
 
 
 class Transcription:
@@ -88,8 +91,8 @@ class Transcription:
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
         self.tops = tops
-        self._tops = np.repeat(tops[:, None], len(grid.s), axis=1)
-        self._smooth = _smoothing(spec.rate_control_points)
+        self.tops_along = np.repeat(tops[:, None], len(grid.s), axis=1)
+        self.smooth = _smoothing(spec.rate_control_points)
         self._at = of_last(self._states)  # steps that are taken are evaluated again, with derivatives
         self._residuals = of_last(self._criterion_residuals)
         self._slopes = of_last(lambda rate: boundary_slopes(boundary, rate[None], spec))
@@ -112,12 +115,12 @@ class Transcription:
     def gauge(self, x: Array) -> float:
         """Return what is minimised beside the objective, since it fixes the gauge between p and r."""
         log = x[self.split :]
-        return float(0.5 * log @ self._smooth @ log)
+        return float(0.5 * log @ self.smooth @ log)
 
     def measured(self, x: Array) -> tuple[float, Array]:
         """Evaluate ``objective`` and residuals (K, m)."""
         w, path, rate = self._at(x)
-        (g,) = self.stage.values(w, self._tops)
+        (g,) = self.stage.values(w, self.tops_along)
         return self.objective(path, rate), g.T
 
     def end_residuals(self) -> Array:
@@ -128,7 +131,7 @@ class Transcription:
         goal_ddq, jerk = free if b.goal_ddq is None else b.goal_ddq[0], [free] * (orders - 3)
         start = np.concatenate([b.start_q[0], b.start_dq[0], b.start_ddq[0], *jerk, unit])
         goal = np.concatenate([b.goal_q[0], b.goal_dq[0], goal_ddq, *jerk, unit])
-        (g,) = self.stage.values(np.stack([start, goal], axis=1), self._tops[:, :2])
+        (g,) = self.stage.values(np.stack([start, goal], axis=1), self.tops_along[:, :2])
         return np.asarray(g.T)
 
     def objective(self, path: Array, rate: Array) -> float:
@@ -147,16 +150,16 @@ class Transcription:
     def evaluate(self, x: Array) -> Linearisation:
         """Evaluate objective and residuals with their derivatives."""
         w, path, rate = self._at(x)
-        g, jacobian = self.stage.jacobian(w, self._tops)
+        g, jacobian = self.stage.jacobian(w, self.tops_along)
         log = x[self.split :]
         slope = self.grid.gauss * rate
         inverse = 1.0 / (self.grid.gauss @ rate)
         cost = float(inverse @ self.grid.weights) + self.gauge(x)
         gradient = np.zeros(self.nx)
-        gradient[self.split :] = -((self.grid.weights * inverse**2) @ slope) + self._smooth @ log
+        gradient[self.split :] = -((self.grid.weights * inverse**2) @ slope) + self.smooth @ log
         curvature = np.zeros((self.nx, self.nx))
         half = slope * np.sqrt(2 * self.grid.weights * inverse**3)[:, None]
-        curvature[self.split :, self.split :] = half.T @ half + self._smooth
+        curvature[self.split :, self.split :] = half.T @ half + self.smooth
         if self.stage.criterion is not None:
             cost += self._add_criterion(path, rate, gradient, curvature)
         return Linearisation(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)

@@ -1,0 +1,354 @@
+/* One step of the sequential quadratic programme of one motion: what transcription.py and quadratic.py say in NumPy,
+over the same compiled kernels.
+
+Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n
+joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
+
+#define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
+
+typedef void kernel(long, const double *const *, const long *, double *const *);
+
+typedef struct { /* a spline basis at some phases */
+  long orders, points;
+  const double *path, *rate;       /* (orders, C, points), (orders - 1, R, points) */
+  const double *path_at, *rate_at; /* (points, C, orders), (points, R, orders - 1) */
+} bases;
+
+typedef struct {
+  long n, path, rate, fixed, nx, stride, m, gauss, criteria, thin; /* stride: of rows of nx + 1, see below */
+  bases grid, nodes;
+  kernel *values, *jacobian, *criterion;
+  const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be missing */
+  const double *top;                    /* (numbers, K) */
+  const double *quadrature, *weights;   /* basis of r at the nodes of the time integral (gauss, R), their weights */
+  const double *criterion_weights;      /* (nodes.points,), times the criterion's weight */
+  const double *smooth;                 /* (R, R) */
+  const double *lower, *upper;          /* (m, K) */
+  const unsigned char *sharp;           /* (m, K) */
+  double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, n), (width, K) */
+  double *gradient, *hessian, *factor;  /* (nx,); above and below the diagonal, (nx, stride) each */
+  double *scratch;
+  int *where, *first; /* row nx + 1 + j is of residual i at point k: where[j] = i K + k; room for as many */
+  polyhedron programme; /* of the box, (nx,), the elastic variable, and the held residuals */
+  double eta, beta, rate_eta, rounded, violation, gain, left;
+  long point[6], variable[6], slopes, held;
+} motion;
+
+/* ---- The motion of variables x: control points, states, objective (Transcription) ---- */
+
+/* The control points at an end, from its state, and how they move with the rate (trajectory/boundary.py, slopes.py). */
+static void end(motion *s, const double *q, const double *dq, const double *ddq, double sign, long last, long step) {
+  long inner = last + step, edge = step > 0 ? 0 : s->path - 1;
+  double r = s->rates[last], eta = s->eta;
+  double rise = ddq ? s->rate_eta * (s->rates[inner] - r) : 0;
+  double *c = s->control + edge * s->n, *c1 = c + step * s->n, *c2 = c1 + step * s->n, *d = s->slope + s->slopes * s->n;
+  EACH(j, 0, s->n) {
+    double v0 = sign * dq[j], first = v0 / r, d1 = -v0 / (r * r * eta);
+    c[j] = q[j];
+    c1[j] = q[j] + first / eta;
+    d[j] = d1;
+    if (ddq) {
+      c2[j] = (ddq[j] - first * rise * r) / (r * r) / s->beta - 2 * q[j] + 3 * c1[j];
+      d[s->n + j] = (-2 * (ddq[j] - v0 * rise) / r + v0 * s->rate_eta) / (r * r) / s->beta + 3 * d1;
+      d[2 * s->n + j] = -v0 * s->rate_eta / (r * r * s->beta);
+    }
+  }
+  EACH(i, 0, ddq ? 3 : 1) {
+    s->point[s->slopes] = edge + (i ? 2 : 1) * step;
+    s->variable[s->slopes++] = i == 2 ? inner : last;
+  }
+}
+
+static void unpack(motion *s, const double *x) {
+  long split = s->nx - s->rate;
+  EACH(i, 0, s->rate) s->rates[i] = exp(x[split + i]);
+  memcpy(s->control + 3 * s->n, x, split * sizeof(double));
+  s->slopes = 0;
+  end(s, s->start_q, s->start_dq, s->start_ddq, 1, 0, 1);
+  end(s, s->goal_q, s->goal_dq, s->goal_ddq, -1, s->rate - 1, -1);
+}
+
+static void states(const motion *s, const bases *b, double *w) {
+  long n = s->n, points = b->points;
+  memset(w, 0, (b->orders * n + b->orders - 1) * points * sizeof(double));
+  EACH(o, 0, b->orders) EACH(c, 0, s->path) EACH(j, 0, n)
+    add(w + (o * n + j) * points, s->control[c * n + j], b->path + (o * s->path + c) * points, points);
+  EACH(o, 0, b->orders - 1) EACH(c, 0, s->rate)
+    add(w + (b->orders * n + o) * points, s->rates[c], b->rate + (o * s->rate + c) * points, points);
+}
+
+/* Take the gradient in w of residual i at phase k out of a Jacobian: joints (orders, padded n), then rates. */
+static void gather(const motion *s, long orders, const double *jacobian, long count, long i, long points, long k,
+                   double *J) {
+  long n = s->n, stride = padded(n);
+  EACH(o, 0, orders) EACH(j, 0, n) J[o * stride + j] = jacobian[((o * n + j) * count + i) * points + k];
+  EACH(o, 0, orders - 1) J[orders * stride + o] = jacobian[((orders * n + o) * count + i) * points + k];
+}
+
+/* Gradient in the variables of a function whose gradient in w, at phase k, is J; `row` has room for W more. */
+static void chain(const motion *s, const bases *b, long k, const double *J, double *row) {
+  long n = s->n, orders = b->orders, split = s->nx - s->rate, stride = padded(n);
+  const double *path = b->path_at + k * s->path * orders, *rate = b->rate_at + k * s->rate * (orders - 1);
+  double ends[6 * stride], *next = ends;
+  memset(row, 0, split * sizeof(double));
+  memset(ends, 0, sizeof ends);
+  EACH(c, 0, s->path) {
+    int inside = c >= 3 && c < s->fixed, far = 1;
+    EACH(o, 0, orders) far &= path[c * orders + o] == 0;
+    double *control = inside ? row + (c - 3) * n : next;
+    if (!inside) next += stride;
+    if (far) { if (inside) EACH(j, 0, n) control[j] = 0; continue; }
+    for (long j = 0; j < n; j += W) {
+      v x = K(0);
+      EACH(o, 0, orders) x += K(path[c * orders + o]) * at(J + o * stride + j);
+      put(control + j, x);
+    }
+  }
+  EACH(i, 0, s->rate) {
+    double x = 0;
+    EACH(o, 0, orders - 1) x += rate[i * (orders - 1) + o] * J[orders * stride + o];
+    row[split + i] = x * s->rates[i];
+  }
+  EACH(e, 0, s->slopes) {
+    long c = s->point[e] < 3 ? s->point[e] : s->point[e] - s->fixed + 3;
+    row[split + s->variable[e]] += dot(ends + c * stride, s->slope + e * n, n) * s->rates[s->variable[e]];
+  }
+}
+
+/* The criterion's integral; its gradient and Gauss-Newton Hessian are added where they are wanted. */
+static double criterion(motion *s, int derivatives) {
+  const bases *b = &s->nodes;
+  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points;
+  long nx = s->nx, stride = s->stride;
+  double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points;
+  double *rows = jacobian + width * count * points;
+  double J[width + b->orders * W], scaled[count], cost = 0;
+  memset(J, 0, sizeof J);
+  states(s, b, w);
+  s->criterion(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
+  EACH(k, 0, points) {
+    double squares = 0, r = w[b->orders * n * points + k], share = s->criterion_weights[k] / r;
+    EACH(i, 0, count) squares += e[i * points + k] * e[i * points + k];
+    double size = sqrt(squares + s->rounded * s->rounded);
+    double rho = s->rounded > 0 ? size - s->rounded : squares, slope = s->rounded > 0 ? 1 / size : 2;
+    cost += share * rho;
+    if (!derivatives) continue;
+    EACH(i, 0, s->rate)
+      s->gradient[nx - s->rate + i] -= share * rho / r * b->rate_at[(k * s->rate + i) * (b->orders - 1)] * s->rates[i];
+    EACH(i, 0, count) {
+      gather(s, b->orders, jacobian, count, i, points, k, J);
+      chain(s, b, k, J, rows + i * stride);
+      add(s->gradient, share * slope * e[i * points + k], rows + i * stride, nx);
+    }
+    EACH(j, 0, nx) {
+      EACH(i, 0, count) scaled[i] = share * slope * rows[i * stride + j];
+      for (long l = j / W * W; l < nx; l += W) {
+        v x = at(s->hessian + j * stride + l);
+        EACH(i, 0, count) x += K(scaled[i]) * at(rows + i * stride + l);
+        put(s->hessian + j * stride + l, x);
+      }
+    }
+  }
+  return cost;
+}
+
+/* The time and what fixes the gauge; their gradient and curvature are set where they are wanted. */
+static double duration(motion *s, const double *log, int derivatives) {
+  long nx = s->nx, split = nx - s->rate, stride = s->stride;
+  double cost = 0;
+  EACH(i, 0, s->rate) {
+    double pull = dot(s->smooth + i * s->rate, log, s->rate);
+    cost += 0.5 * log[i] * pull;
+    if (!derivatives) continue;
+    s->gradient[split + i] = pull;
+    memcpy(s->hessian + (split + i) * stride + split, s->smooth + i * s->rate, s->rate * sizeof(double));
+  }
+  EACH(q, 0, s->gauss) {
+    const double *basis = s->quadrature + q * s->rate;
+    double slope[s->rate], inverse = 1 / dot(basis, s->rates, s->rate), weight = s->weights[q] * inverse;
+    cost += weight;
+    if (!derivatives) continue;
+    EACH(i, 0, s->rate) slope[i] = basis[i] * s->rates[i];
+    add(s->gradient + split, -weight * inverse, slope, s->rate);
+    EACH(i, 0, s->rate) if (slope[i] != 0)
+      add(s->hessian + (split + i) * stride + split + i, 2 * weight * inverse * inverse * slope[i], slope + i,
+          s->rate - i);
+  }
+  return cost;
+}
+
+/* How far outside a residual is: number i of those at all points. */
+I double outside(const motion *s, const double *g, long i) {
+  double over = g[i] - s->upper[i], under = s->lower[i] - g[i];
+  return over > under ? over : under;
+}
+
+static double worst(const motion *s, const double *g) {
+  double found = 0;
+  EACH(i, 0, s->m * s->grid.points) {
+    double excess = outside(s, g, i);
+    if (excess != excess) return INFINITY;
+    if (excess > found) found = excess;
+  }
+  return found;
+}
+
+/* Residuals (m, K) and the objective of variables x; the worst violation is left in `violation`. */
+double look(motion *s, const double *x, double *g) {
+  unpack(s, x);
+  states(s, &s->grid, s->w);
+  long points = s->grid.points, ld[2] = {points, points};
+  s->values(points, (const double *const[]){s->w, s->top}, ld, (double *const[]){g});
+  s->violation = worst(s, g);
+  return duration(s, x + s->nx - s->rate, 0) + (s->criterion ? criterion(s, 0) : 0);
+}
+
+/* ---- The quadratic model there (choose and QuadraticModel) ---- */
+
+/* Factor the Hessian with the proximal term, diagonal inverted: dividing rows by it gives variables where it is 1. */
+static int factor(motion *s, double proximal) {
+  long nx = s->nx, stride = s->stride;
+  EACH(k, 0, nx) {
+    double *row = s->hessian + k * stride, pivot = row[k] + proximal;
+    if (!(pivot > 0)) return 0;
+    double scale = 1 / sqrt(pivot);
+    EACH(i, k + 1, nx) s->factor[i * stride + k] = row[i] *= scale;
+    s->factor[k * stride + k] = scale;
+    EACH(i, k + 1, nx) add(s->hessian + i * stride + i, -row[i], row + i, nx - i);
+  }
+  return 1;
+}
+
+/* Divide B rows side by side, (nx, B), by the factor; their first `from` entries are 0. */
+static void whiten(const motion *s, double *block, long from) {
+  for (long i = from; i < s->nx; i += 2) {
+    const double *row = s->factor + i * s->stride, *other = row + (i + 1 < s->nx ? s->stride : 0);
+    v x[4], y[4];
+    EACH(l, 0, 4) x[l] = at(block + i * B + l * W), y[l] = at(block + (i + 1) * B + l * W);
+    EACH(j, from, i) EACH(l, 0, 4) {
+      v above = at(block + j * B + l * W);
+      x[l] -= K(row[j]) * above;
+      y[l] -= K(other[j]) * above;
+    }
+    EACH(l, 0, 4) {
+      put(block + i * B + l * W, x[l] *= K(row[i]));
+      if (other != row) put(block + (i + 1) * B + l * W, (y[l] - K(other[i]) * x[l]) * K(other[i + 1]));
+    }
+  }
+}
+
+/* Mark crests along the motion, what is beside them, and the thin grid. */
+static void crest(const motion *s, const double *excess, unsigned char *wide) {
+  long last = s->grid.points - 1;
+  EACH(k, 0, last + 1) wide[k] = k % s->thin == 0;
+  EACH(k, 0, last + 1) if ((k == 0 || excess[k] >= excess[k - 1]) && (k == last || excess[k] >= excess[k + 1]))
+    EACH(near, k > 0 ? k - 1 : 0, k < last ? k + 2 : k + 1) wide[near] = 1;
+}
+
+static double leap(const motion *s, long k, const double *J, double step) {
+  const bases *b = &s->grid;
+  double reach = 0;
+  EACH(o, 1, b->orders - 1) {
+    double change = 0;
+    EACH(i, 0, s->rate) change += fabs(b->rate_at[(k * s->rate + i) * (b->orders - 1) + o]) * s->rates[i];
+    reach += fabs(J[b->orders * padded(s->n) + o]) * change * step;
+  }
+  return reach;
+}
+
+/* Evaluate the motion at x, and gradient and factor of its objective. 0: the Hessian is not positive. */
+static int objective(motion *s, const double *x, double proximal) {
+  unpack(s, x);
+  states(s, &s->grid, s->w);
+  memset(s->gradient, 0, s->nx * sizeof(double));
+  memset(s->hessian, 0, s->nx * s->stride * sizeof(double));
+  duration(s, x + s->nx - s->rate, 1);
+  if (s->criterion) criterion(s, 1);
+  return factor(s, proximal);
+}
+
+/* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, that may leap
+over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
+void model(motion *s, const double *x, const double *g, double proximal, double near, double step,
+           const unsigned char *missed, const double *multipliers, unsigned char *held) {
+  long nx = s->nx, points = s->grid.points, width = s->grid.orders * s->n + s->grid.orders - 1, m = s->m;
+  polyhedron *p = &s->programme;
+  if (!(p->count = objective(s, x, proximal))) return;
+  double *excess = s->scratch, *values = excess + m * points, *jacobian = values + m * TILE;
+  double *row = jacobian + width * m * TILE, J[width + s->grid.orders * W];
+  memset(J, 0, sizeof J);
+  EACH(i, 0, m * points) excess[i] = outside(s, g, i);
+  EACH(i, 0, m) crest(s, excess + i * points, held + i * points);
+  EACH(i, 0, m * points)
+    held[i] = (held[i] && excess[i] > -near) || missed[i] || (multipliers && multipliers[i] != 0);
+
+  long count = nx + 1;
+  memset(p->rows, 0, (count + B) / B * count * B * sizeof(double));
+  EACH(i, 0, nx) *entry(p, i, i) = 1;
+  for (long first = 0; first < points; first += TILE) {
+    long tile = points - first < TILE ? points - first : TILE, ld[2] = {points, points};
+    s->jacobian(tile, (const double *const[]){s->w + first, s->top + first}, ld, (double *const[]){values, jacobian});
+    EACH(t, 0, tile) EACH(i, 0, m) {
+      long k = first + t, number = i * points + k;
+      if (!held[number] && !s->sharp[number]) continue;
+      gather(s, s->grid.orders, jacobian, m, i, tile, t, J);
+      if (!held[number] && !(excess[number] > -leap(s, k, J, step))) continue;
+      held[number] = 1;
+      s->where[count - nx - 1] = number;
+      chain(s, &s->grid, k, J, row);
+      if (count % B == 0) memset(entry(p, count, 0), 0, (nx + 1) * B * sizeof(double));
+      EACH(j, 0, nx) *entry(p, count, j) = row[j];
+      count++;
+    }
+  }
+  for (long first = 0; first < count; first += B) whiten(s, entry(p, first, 0), first + B <= nx ? first : 0);
+  s->held = count - nx - 1, p->count = count;
+}
+
+/* How far the rows may go, and what the elastic variable adds to them. */
+static void bound(motion *s, const double *g, const double *box, double softness, int relax) {
+  long dim = s->nx + 1;
+  const polyhedron *p = &s->programme;
+  EACH(i, 0, s->nx) p->high[i] = box[i], p->low[i] = -box[i];
+  *entry(p, s->nx, s->nx) = 1 / softness, p->low[s->nx] = 0, p->high[s->nx] = 1;
+  EACH(i, 0, s->held) {
+    long at = s->where[i];
+    double rise = s->upper[at] - g[at], fall = s->lower[at] - g[at], above = rise < 0, below = fall > 0, elastic;
+    if (relax) above = rise < -fall, below = !above, elastic = above ? -s->violation : s->violation;
+    else elastic = above ? rise : below ? fall : 0;
+    p->high[dim + i] = below ? INFINITY : rise;
+    p->low[dim + i] = above ? -INFINITY : fall;
+    *entry(p, dim + i, s->nx) = elastic / softness;
+  }
+}
+
+/* Solve the programme that `model` has laid out; 0 where there is none, it has no solution, or not in so many changes.
+
+The step is within the box, (nx,), and costs `slope` times the share of the violations that it leaves, which all rows
+may use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, if they are more than `least`;
+`multipliers` are those of the solution. */
+int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
+          double least, double feasible, int changes, double *dx, double *multipliers) {
+  long nx = s->nx, dim = nx + 1, stride = s->stride, count = 0;
+  double f[dim], x[dim];
+  if (!s->programme.count) return 0;
+  bound(s, g, box, softness, relax);
+  EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * stride, f, i)) * s->factor[i * stride + i];
+  f[nx] = slope / softness;
+  if (before) EACH(i, 0, s->held) {
+    double was = before[s->where[i]];
+    if (fabs(was) > least) s->first[count++] = (int)(was > 0 ? dim + i + 1 : -(dim + i + 1));
+  }
+  working set;
+  if (!nearest(&s->programme, f, s->first, count, feasible, changes, x, &set)) return 0;
+  EACH(i, 0, set.count) if (set.row[i] >= dim)
+    multipliers[s->where[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
+  s->gain = -dot(f, x, nx) - 0.5 * dot(x, x, nx);
+  s->left = x[nx] / softness;
+  memcpy(dx, x, nx * sizeof(double));
+  for (long i = nx - 1; i >= 0; i--) {
+    dx[i] *= s->factor[i * stride + i];
+    add(dx, -dx[i], s->factor + i * stride, i);
+  }
+  return 1;
+}
