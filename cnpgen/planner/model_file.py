@@ -140,6 +140,8 @@ def _assembled(content: Content) -> Model:
     _check_sizes(problem, architecture, features)
     if unknown := set(description["rest"]) - set(CONDITIONS):
         raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
+    if positions := {"start_q", "goal_q"} & set(description["rest"]):
+        raise ValueError(f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row")
     if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
         raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
     if meaning.expected_time not in EXPECTED_TIMES:

@@ -132,6 +132,7 @@ FORGERIES = {
     "as many steps as never end": (
         described("meaning", landing_steps=10**18), "there are at most 20 steps"),
     "unknown zeros": (described("", rest=["../../x"]), "unknown boundary conditions ../../x"),
+    "zeros that cannot be": (described("", rest=["start_q"]), "start_q: only velocities and accelerations are zero"),
     "an infinite scale": (described("meaning", path_scale="inf"), "cannot be meant"),
     "layers without end": (described("architecture", layers=10**30), "layers must be a whole"),
     "many layers": (described("architecture", layers=10**9), "1000000000 layers cannot be in"),
