@@ -43,7 +43,20 @@ typedef long long integer;
 #define MANTISSA 52
 #endif
 
-#if defined(__AVX__) && !defined(__clang__) /* GCC's own names: reading immintrin.h takes longer than a small kernel */
+/* GCC's own names, where it has them: reading immintrin.h takes longer than compiling a small kernel. */
+#if defined(__has_builtin) && !defined(__clang__)
+#ifdef __AVX512F__
+#if __has_builtin(__builtin_ia32_sqrtpd512_mask) && __has_builtin(__builtin_ia32_maxpd512_mask)
+#define OWN_NAMES
+#endif
+#elif defined(__AVX__)
+#if __has_builtin(__builtin_ia32_sqrtpd256) && __has_builtin(__builtin_ia32_maxpd256)
+#define OWN_NAMES
+#endif
+#endif
+#endif
+
+#ifdef OWN_NAMES
 #ifdef __AVX512F__
 #define BYTES 64
 #ifdef SINGLE
