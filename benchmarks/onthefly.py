@@ -53,6 +53,7 @@ GOALS = {  # share of valid plans, as the network gives them
 REFINED_VALID, OVER_REFINED, REFINE_MS, REFINE_P95_MS = 0.998, 1.08, 8.0, 15.0
 
 State = tuple[Any, Any, Any]
+Goals = dict[str, tuple[float, bool]]  # figure -> its goal, and whether that is the most rather than the least
 
 
 def first_motions(count: int, seed: int) -> Plans:
@@ -134,13 +135,17 @@ def measure(planner: Planner, boundary: Boundary, refined: int) -> dict[str, flo
     }
 
 
-def rows_of(model: str, name: str, found: dict[str, float]) -> list[tuple[str, ...]]:
-    """Lay out what was found of a set, each figure beside its goal."""
-    goals = {
+def goals_of(name: str) -> Goals:
+    """Say what is wanted of a set."""
+    return {
         "valid alone": (GOALS[name], False), "valid refined": (REFINED_VALID, False),
         "T / refined": (OVER_REFINED, True), "refine, median ms": (REFINE_MS, True),
         "refine, p95 ms": (REFINE_P95_MS, True),
     }  # fmt: skip
+
+
+def rows_of(model: str, name: str, found: dict[str, float], goals: Goals) -> list[tuple[str, ...]]:
+    """Lay out what was found of a set, each figure beside its goal."""
     rows = []
     for what, value in found.items():
         goal, at_most = goals.get(what, (None, False))
@@ -167,7 +172,7 @@ def main() -> None:
             progress(f"{model}: {name}")
             results.setdefault(model, {})[name] = measure(planner, boundary, chosen.refined)
     each = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
-    rows = [row for model, name, found in each for row in rows_of(model, name, found)]
+    rows = [row for model, name, found in each for row in rows_of(model, name, found, goals_of(name))]
     head = ("planner", "problems", "figure", "value", "goal", "")
     report({"onthefly": results}, [table("planning on the fly", head, rows, left=3)], as_json=chosen.json)
 

@@ -25,6 +25,7 @@ printed on stdout. docs/training.md says how to choose.
 """
 
 _CHECK = "validation rows to compare models by, half of all at most (default: 200)"
+_STEPS = ("bending_steps", "landing_steps")
 _SECONDS = "how long to train: CPU time of the steps; compiling and validations come on top (default: 2 min)"
 
 
@@ -73,11 +74,22 @@ def _add_how(parser: Parser) -> None:
     )
     option("--rate-bias", metavar="X", type=float, help="logarithm of the first guess of that factor (default: -0.5)")
     option(
+        "--bending-steps", metavar="N", type=values.positive, help="steps that bend the line to the goal (default: 1)"
+    )
+    option("--landing-steps", metavar="N", type=values.positive, help="likewise of what the network gives (default: 1)")
+    option(
         "--imitate",
         metavar="X",
         type=float,
         help="begin with so large a fraction of the steps, such as 0.1, that imitate the plans of a dataset made with"
         " --certify (default: 0)",
+    )
+    option(
+        "--from",
+        dest="start_from",
+        metavar="MODEL",
+        help="begin with the parameters of a model, by name or file, instead of random ones; --hidden, --layers and"
+        " --expected-time must be as it was trained with",
     )
     option("--seed", metavar="S", type=values.seed, help="of the first parameters and the order of rows (default: 0)")
 
@@ -120,6 +132,7 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
         arguments.folder,
         arguments.out,
         settings=_settings(arguments),
+        start_from=arguments.start_from,
         steps=arguments.steps,
         epochs=arguments.epochs,
         cpu_seconds=arguments.cpu_seconds,
@@ -136,7 +149,7 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
     from cnpgen.errors import UsageError
     from cnpgen.training.settings import METRICS, TrainingSettings
 
-    names = ("hidden", "layers", "batch_size", "learning_rate", "expected_time", "rate_bias", "seed")
+    names = ("hidden", "layers", "batch_size", "learning_rate", "expected_time", "rate_bias", *_STEPS, "seed")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     metric = METRICS[arguments.metric or "ramped"]
     if arguments.growth is not None and metric.kind == "fixed":
@@ -152,10 +165,12 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
     lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
-    names = (*lengths, *network, "metric", "growth", "expected_time", "rate_bias", "imitate", "seed", "check")
+    names = (*lengths, *network, "metric", "growth", "expected_time", "rate_bias", *_STEPS, "imitate", "seed", "check")
     default = arguments.parser.get_default
     said = [(name, getattr(arguments, name)) for name in names]
     said[-2:-2] = [("margin", f"{term}={factor:g}") for term, factor in arguments.margin or ()]
+    if arguments.start_from is not None:
+        said.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
     options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
     places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]
     return " ".join(["cnpgen train", places[0], "-o", places[1], *options])

@@ -15,6 +15,7 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.model import Model
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
@@ -30,7 +31,13 @@ WARMING, TIMED = 10, 50  # steps taken to find out how long one takes
 
 
 def prepare_run(
-    source: TrainingData, given: Surroundings, settings: TrainingSettings, *, check_rows: int = 200, command: str = ""
+    source: TrainingData,
+    given: Surroundings,
+    settings: TrainingSettings,
+    *,
+    first: Model | None = None,
+    check_rows: int = 200,
+    command: str = "",
 ) -> tuple[Run, Kit]:
     """Load rows, kernels and loss; set up the network.
 
@@ -38,6 +45,7 @@ def prepare_run(
         source: The dataset.
         given: Its problem.
         settings: How to train.
+        first: The model to start from; None for random parameters and features standardised by the rows.
         check_rows: Validation rows that models are compared by.
         command: What the model says that it was made by.
 
@@ -45,17 +53,19 @@ def prepare_run(
         The run, and the kit that plans are made with.
 
     Raises:
-        UsageError: Plans are to be imitated, and the dataset has none.
+        UsageError: Plans are to be imitated, and the dataset has none; or the first model is for something else.
     """
     boundary = source.training()
     rest, spec = resting(boundary), given.problem.trajectory
     kit = make_kit(given, settings.meaning, slow_down=len(rest) == 3)  # all of them
-    rows, features = prepare_rows(boundary, kit.prepare)
+    rows, features = prepare_rows(boundary, kit.prepare, features=None if first is None else first.features)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
     loss = _loss(given, settings)
     held_out = source.checked(check_rows)
     architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
+    if first is not None:
+        _check_first(first, architecture, settings, given, rest)
     run = Run(
         learner=Learner(architecture, spec, loss, settings, _landing(given, settings)),
         names=loss.terms,
@@ -66,6 +76,7 @@ def prepare_run(
         problem=given.record,
         validate=lambda model: validate(model, kit, held_out),
         rest=rest,
+        first=None if first is None else first.parameters,
         training={"command": command, **identity(source, settings), "stages": source.dataset.blueprint.stages},
     )
     return run, kit
@@ -84,6 +95,24 @@ def _with_demonstrations(rows: Rows, source: TrainingData, given: Surroundings) 
             " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
     return replace(rows, shown=shown)
+
+
+def _check_first(
+    first: Model, architecture: Architecture, settings: TrainingSettings, given: Surroundings, rest: tuple[str, ...]
+) -> None:
+    """Refuse a model whose parameters would mean something else in this run."""
+    if first.problem.comparable_sha256 != given.record.comparable_sha256:
+        differs = ", ".join(given.record.differences(first.problem)[:4])
+        raise UsageError(f"the model to start from is for another problem, they differ in {differs}")
+    meaning = settings.meaning
+    theirs = {**asdict(first.architecture), "path_scale": first.meaning.path_scale, "zero conditions": first.rest}
+    ours = {**asdict(architecture), "path_scale": meaning.path_scale, "zero conditions": rest}
+    theirs["expected_time"], ours["expected_time"] = first.meaning.expected_time, meaning.expected_time
+    changed = [
+        f"{name} is {theirs[name]!r} there and {ours[name]!r} here" for name in ours if theirs[name] != ours[name]
+    ]
+    if changed:
+        raise UsageError(f"the model to start from does not fit: {', '.join(changed)}")
 
 
 def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Boundary, *, inputs: int) -> Architecture:
@@ -133,12 +162,15 @@ def begin_run(run: Run, length: Length) -> State:
 
 def _fresh(run: Run, steps: int) -> State:
     settings = run.learner.settings
-    parameters = initial_parameters(
-        run.learner.architecture,
-        seed=settings.seed,
-        head_scale=settings.head_scale,
-        rate_bias=settings.rate_bias,
-    )
+    if run.first is not None:
+        parameters = run.first.copy()
+    else:
+        parameters = initial_parameters(
+            run.learner.architecture,
+            seed=settings.seed,
+            head_scale=settings.head_scale,
+            rate_bias=settings.rate_bias,
+        )
     return start_state(parameters, terms=len(run.names), steps=steps, imitation=settings.imitation)
 
 

@@ -44,6 +44,7 @@ class Run:
         problem: The problem.
         validate: Judges a model: a record for the log with a ``score``, the larger the better.
         rest: Boundary conditions that are zero in every training row.
+        first: Parameters to start from; None for random ones.
         training: What the model will say of how it was made.
         order: Which rows a step trains on.
     """
@@ -57,6 +58,7 @@ class Run:
     problem: ProblemRecord
     validate: Validate
     rest: tuple[str, ...] = ()
+    first: Array | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

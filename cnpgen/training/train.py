@@ -10,9 +10,10 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.planner.kit import Kit, surroundings
 from cnpgen.planner.model import Model
-from cnpgen.planner.model_file import load_model, save_model
+from cnpgen.planner.model_file import find_model, load_model, save_model
 from cnpgen.problems.record import as_record
 from cnpgen.schema.arguments import integer
+from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.data import TrainingData, open_training_data
@@ -56,6 +57,7 @@ def train_model(
     epochs: float | None = None,
     cpu_seconds: float | None = None,
     settings: TrainingSettings | None = None,
+    start_from: str | Path | None = None,
     check_rows: int = 200,
     command: str = "",
     force: bool = False,
@@ -76,6 +78,8 @@ def train_model(
         cpu_seconds: How long, in CPU time of the steps [s]: how long a step takes is measured before, and their number
             is then fixed. Compiling, reading rows and validating come on top. If nothing says how long, 120 s.
         settings: How to train.
+        start_from: A model, by name or path, whose parameters and features the run begins with, instead of random
+            parameters; width, depth and the meaning of outputs in the settings must be those that it has.
         check_rows: Validation rows that models are compared by on the way, half of them at most; the best one is judged
             on up to 2,000 others.
         command: What the model says that it was made by.
@@ -85,20 +89,23 @@ def train_model(
         watch: Called with every line of the log.
 
     Raises:
-        UsageError: An argument cannot be meant, or there is another model, another run's checkpoint, or a log or
-            picture of something else.
+        UsageError: An argument cannot be meant, there is no model to start from or it is for something else, or there
+            is another model, another run's checkpoint, or a log or picture of something else.
         DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """
     clock = Stopwatch()
     lasts = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
-    job = _job(folder, Path(out), settings or TrainingSettings(), lasts, check_rows)
+    settings = settings or TrainingSettings()
+    job = _job(folder, Path(out), settings, lasts, check_rows=check_rows, start_from=start_from)
     if not force:
         if job.out.exists() and not job.checkpoints.path.exists():
             return _finished(job)
         check_beside(job.out)
     with one_thread(), surroundings(as_record(job.source.dataset.problem)) as given:
-        run, kit = prepare_run(job.source, given, job.settings, check_rows=job.check_rows, command=command)
+        run, kit = prepare_run(
+            job.source, given, job.settings, first=job.first, check_rows=job.check_rows, command=command
+        )
         state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
         clock.prepared()
         if begin is not None:
@@ -113,9 +120,10 @@ def train_model(
 
 @dataclass(frozen=True)
 class _Job:
-    """What is to be trained, on what, for how long, and where it goes."""
+    """What is to be trained, on what, from what, for how long, and where it goes."""
 
     source: TrainingData
+    first: Model | None
     out: Path
     settings: TrainingSettings
     length: Length
@@ -123,15 +131,31 @@ class _Job:
     checkpoints: Checkpoints
 
 
-def _job(folder: str | Path, out: Path, settings: TrainingSettings, lasts: Mapping[str, Any], check_rows: int) -> _Job:
-    """Check what was asked for, and open the dataset."""
+def _job(
+    folder: str | Path,
+    out: Path,
+    settings: TrainingSettings,
+    lasts: Mapping[str, Any],
+    *,
+    check_rows: int,
+    start_from: str | Path | None,
+) -> _Job:
+    """Check what was asked for, open the dataset, and read the model to start from."""
     given = {name: value for name, value in lasts.items() if value is not None} or {"cpu_seconds": SECONDS}
     length, check_rows = Length(**given), integer("check_rows", check_rows, least=1)
     check_out(out)
     sweep_beside(out)
     source = open_training_data(folder)
-    asked = {**identity(source, settings), "length": plain(given), "check_rows": check_rows}
-    return _Job(source, out, settings, length, check_rows, Checkpoints(out.with_suffix(CHECKPOINT), asked))
+    first, digest = _first(start_from)
+    asked = {**identity(source, settings), "length": plain(given), "check_rows": check_rows, "start_from": digest}
+    return _Job(source, first, out, settings, length, check_rows, Checkpoints(out.with_suffix(CHECKPOINT), asked))
+
+
+def _first(start_from: str | Path | None) -> tuple[Model | None, str | None]:
+    """Read the model to start from, and its file's sha256; None where there is none."""
+    if start_from is None:
+        return None, None
+    return load_model(start_from), file_sha256(find_model(start_from))
 
 
 def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: TrainingLog, workers: int | None) -> Trained:

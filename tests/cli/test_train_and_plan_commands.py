@@ -168,6 +168,10 @@ def test_the_command_in_a_model_is_the_one_that_was_given(tiny, tmp_path, monkey
     command = load_model(path).training["command"]
     assert command.startswith("cnpgen train airhockey-hit -o 'my model.h5' --steps 40")
     assert "--learning-rate 0.00123456789 " in command
+    again = ["--steps", "2", "--hidden", "16", "--layers", "2", "--check", "2", "--from", str(path), "--quiet"]
+    assert main(["train", ".", "-o", str(tmp_path / "next.h5"), *again]) == 0
+    command = load_model(tmp_path / "next.h5").training["command"]
+    assert command.startswith("cnpgen train airhockey-hit -o next.h5 --from 'my model.h5' --steps 2 --hidden 16")
 
 
 def test_growth_that_changes_nothing_is_refused(tiny, tmp_path, capsys):

@@ -9,7 +9,10 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, GoalIK, ik_step
-from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.stages.stage import Round, TaskRound
+from cnpgen.schema import registry
+from cnpgen.schema.catalogue import read_kind
+from cnpgen.schema.keys import Place
 from tests.conftest import Arm, Prepare, run_stages
 
 EXACT = 1e-9  # m and rad
@@ -160,3 +163,55 @@ def test_stages_say_what_they_do_with_their_numbers(prepare):
         "solve the goal configuration with the tip's z axis vertical from the start configuration"
     )
     assert hit.stage[1].describe() == "solve the start configuration from the base configuration"
+
+
+@pytest.fixture(scope="module")
+def anywhere(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
+    """Transports between configurations that were chosen independently of each other, some on joint limits."""
+    return prepare("heavy-object-anywhere"), run_stages(prepare("heavy-object-anywhere"), 20_000, seed=39)
+
+
+def test_joints_that_are_held_end_on_their_limits_to_the_bit(anywhere):
+    prepared, _ = anywhere
+    draws = run_stages(prepared, 20_000, seed=40, until="StartIK")
+    robot = prepared.context.robot
+    held, limits = draws["held"].astype(bool), (robot.position_lower[:, None], robot.position_upper[:, None])
+    assert set(held.sum(0)) == {0, 1}
+    assert held.any(1).all()
+    assert np.all(((draws["start_q"] == limits[0]) | (draws["start_q"] == limits[1]))[held])
+    arm = Arm(robot)
+    found = np.array([arm.pose(q).translation.copy() for q in draws["start_q"].T])
+    assert np.linalg.norm(found - draws["start_xyz"].T, axis=1).max() < EXACT
+
+
+def test_goals_from_guesses_are_those_that_their_guesses_lead_to(anywhere):
+    prepared, draws = anywhere
+    stage = next(stage for stage in prepared.pipeline.stage if isinstance(stage, GoalIK))
+    kernel = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8, hold=True)
+    again, _ = kernel(draws["guess_q"], draws["goal_xyz"], draws["held"])
+    np.testing.assert_array_equal(draws["goal_q"], again)
+    from_start = (draws["guess_q"] == draws["start_q"]).all(0)
+    assert from_start.mean() > stage.from_start
+    assert not draws["held"][:, from_start].any()
+    change = np.abs(draws["goal_q"] - draws["start_q"]).max(0)
+    assert 0.95 * stage.max_change < change.max() <= stage.max_change
+    assert np.median(change[~from_start]) > 1.5 * np.median(change[from_start])
+
+
+def test_tasks_have_goals_that_are_found_from_the_start(prepare, anywhere):
+    prepared, draws = anywhere
+    stage = next(stage for stage in prepared.pipeline.stage if isinstance(stage, GoalIK))
+    round_of, tasks = prepare("heavy-object"), TaskRound(10)
+    for name in ("start_q", "goal_xyz"):
+        tasks[name] = draws[name][:, :10].copy()
+    stage.complete(prepared.context, ("start_q", "goal_xyz"))(tasks, np.random.default_rng(0))
+    kernel = round_of.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8)
+    again, error = kernel(draws["start_q"][:, :10], draws["goal_xyz"][:, :10])
+    np.testing.assert_array_equal(tasks["goal_q"], again[:, error[0] < TOLERANCE])
+
+
+@pytest.mark.parametrize("key", ["from_start", "at_limit"])
+def test_goals_from_the_start_alone_have_no_guesses_to_choose_from(key):
+    mistakes: list[str] = []
+    read_kind(registry.STAGES, {"use": "goal-ik", key: 0.5}, Place("x.toml"), mistakes)
+    assert f"{key}: needs random guesses" in mistakes[0]

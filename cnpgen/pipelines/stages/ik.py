@@ -1,5 +1,6 @@
 """Stages: inverse kinematics of the start and of the goal, position alone or position and vertical orientation."""
 
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -35,14 +36,14 @@ class _IK(Stage):
     orientation: str = field("what the tip's orientation must be", choices=("free", "vertical"), default="free")
     max_step: float = field("largest change of a joint in one iteration", unit="rad", default=0.4, low=1e-3)
 
-    def _solve(self, context: Context, end: str, initial: str) -> Work:
-        kernel = context.kernels.load(
-            ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=self.orientation == "vertical", max_step=self.max_step
-        )
+    def _solve(self, context: Context, end: str, initial: str, *, hold: bool = False) -> Work:
+        options = {"vertical": self.orientation == "vertical", "max_step": self.max_step, "hold": hold}
+        kernel = context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), **options)
         low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
 
         def work(draws: Round, _random: np.random.Generator) -> None:
-            q, error = kernel(draws[initial], draws[f"{end}_xyz"])
+            held = (draws["held"],) if hold else ()
+            q, error = kernel(draws[initial], draws[f"{end}_xyz"], *held)
             draws[f"{end}_q"] = q
             draws.reject(error[0] < TOLERANCE, f"no inverse kinematics of the {end}")
             q = draws[f"{end}_q"]
@@ -59,24 +60,53 @@ class GuessedIK(_IK):
     """From a random guess, or from the base configuration."""
 
     guess: tuple[Range, ...] = field("box of random guesses; none: the base configuration", unit="rad", default=())
+    at_limit: float = field(
+        "fraction of the guesses of which one joint, any of them, is put on one of its limits and held there",
+        low=0.0,
+        high=1.0,
+        default=0.0,
+        late=True,
+    )
 
     def _origin(self) -> str:
         """Say from where."""
         box = " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess)
-        return f"a random guess in {box} rad" if self.guess else "the base configuration"
+        held = f", with one joint held on a limit in {100 * self.at_limit:.4g} % of the cases" if self.at_limit else ""
+        return (f"a random guess in {box} rad" if self.guess else "the base configuration") + held
 
     def _solve_guessed(self, context: Context, end: str) -> Work:
+        guess, solve = self._guesses(context), self._solve_from_guess(context, end)
+
+        def work(draws: Round, random: np.random.Generator) -> None:
+            guess(draws, random)
+            solve(draws, random)
+
+        return work
+
+    def _solve_from_guess(self, context: Context, end: str) -> Work:
+        return self._solve(context, end, "guess_q", hold=self.at_limit > 0)
+
+    def _guesses(self, context: Context) -> Work:
+        """Return what draws guesses."""
         n = context.robot.n
         if self.guess and len(self.guess) != n:
             raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
         guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
-        solve = self._solve(context, end, "guess_q")
 
         def work(draws: Round, random: np.random.Generator) -> None:
             draws["guess_q"] = uniform(draws.draw(random, n), guess)
-            solve(draws, random)
+            if self.at_limit:
+                self._put_on_limits(draws, random, context.robot)
 
         return work
+
+    def _put_on_limits(self, draws: Round, random: np.random.Generator, robot: "Robot") -> None:
+        choice, joint, side = draws.draw(random, 3)
+        which = np.minimum((joint * robot.n).astype(int), robot.n - 1)
+        held = (np.arange(robot.n)[:, None] == which) & (choice < self.at_limit)
+        limit = np.where(side < 0.5, robot.position_lower[:, None], robot.position_upper[:, None])
+        draws["guess_q"] = np.where(held, limit, draws["guess_q"])
+        draws["held"] = held.astype(float)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,14 +129,42 @@ class StartIK(GuessedIK):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GoalIK(_IK):
-    """Joint positions of the goal, from the start configuration."""
+class GoalIK(GuessedIK):
+    """Joint positions of the goal, from the start configuration, or from a guess that knows nothing of it."""
 
     needs = ("goal_xyz", "start_q")
+    guess: tuple[Range, ...] = field(
+        "box of random guesses; none: the start configuration", unit="rad", default=(), late=True
+    )
+    from_start: float = field(
+        "fraction of the goals that are found from the start configuration, though there are guesses",
+        low=0.0,
+        high=1.0,
+        default=0.0,
+        late=True,
+    )
+    max_change: float | None = field(
+        "largest difference of a joint between start and goal; goals farther away are rejected",
+        unit="rad",
+        low=1e-3,
+        default=None,
+        late=True,
+    )
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, what is wrong with it)."""
+        for name in ("from_start", "at_limit"):
+            if getattr(self, name) and not self.guess:
+                yield name, "needs random guesses: give guess, too"
 
     def describe(self) -> str:
         """Say from where."""
-        return f"solve the goal configuration{self._how()} from the start configuration"
+        origin = self._origin() if self.guess else "the start configuration"
+        if self.from_start:
+            origin += f", but in {100 * self.from_start:.4g} % of the cases from the start configuration"
+        if self.max_change is not None:
+            origin += f"; no joint may be farther than {self.max_change:.4g} rad from the start"
+        return f"solve the goal configuration{self._how()} from {origin}"
 
     def provides(self, context: Context) -> tuple[Field, ...]:
         """The goal configuration."""
@@ -114,10 +172,40 @@ class GoalIK(_IK):
 
     def prepare(self, context: Context) -> Work:
         """Load the kernel."""
-        return self._solve(context, "goal", "start_q")
+        search, most = self._search(context), self.max_change
+        if most is None:
+            return search
+
+        def work(draws: Round, random: np.random.Generator) -> None:
+            search(draws, random)
+            change = np.abs(draws["goal_q"] - draws["start_q"]).max(0)
+            draws.reject(change <= most, "goal configuration too far from the start's")
+
+        return work
+
+    def _search(self, context: Context) -> Work:
+        if not self.guess:
+            return self._solve(context, "goal", "start_q")
+        guess, solve = self._guesses(context), self._solve_from_guess(context, "goal")
+
+        def work(draws: Round, random: np.random.Generator) -> None:
+            guess(draws, random)
+            there = draws.draw(random, 1)[0] < self.from_start
+            draws["guess_q"] = np.where(there, draws["start_q"], draws["guess_q"])
+            if self.at_limit:
+                draws["held"] = np.where(there, 0.0, draws["held"])
+            solve(draws, random)
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> Work:
+        """Search from the start: goals of tasks are to be close to where the arm is."""
+        if self.guess:
+            return GoalIK(orientation=self.orientation, max_step=self.max_step).complete(context, given)
+        return super().complete(context, given)
 
 
-def ik_step(robot: "Robot", *, vertical: bool, max_step: float) -> Any:
+def ik_step(robot: "Robot", *, vertical: bool, max_step: float, hold: bool = False) -> Any:
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
     A joint that the step would carry beyond its limit is put on the limit and the rest of the step is redistributed
@@ -127,16 +215,20 @@ def ik_step(robot: "Robot", *, vertical: bool, max_step: float) -> Any:
         robot: The robot.
         vertical: Whether the tip's z axis must be vertical, too.
         max_step: Largest change of a joint [rad].
+        hold: Whether there is a third argument, which is 1 for joints that stay where they are and 0 for all others.
     """
     import casadi as ca
 
     (q_sx, q), (p_sx, p) = symbols("q", robot.n), symbols("p", 3)
+    held_sx, held = symbols("held", robot.n)
     kin = forward_kinematics(robot.chain, q)
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     error = subtract(p, kin.tip)
     if vertical:
         tilt, tilt_rows = _tilt(kin)
         error, rows = [*error, *tilt], [*rows, *tilt_rows]
+    if hold:
+        rows = [[x * (1 - stays) for x, stays in zip(row, held, strict=True)] for row in rows]
     square = dot(error, error)
     step, factor = _clipped(rows, error, max_step, DAMPING)
     target = add(q, step)
@@ -149,7 +241,8 @@ def ik_step(robot: "Robot", *, vertical: bool, max_step: float) -> Any:
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
     again, _ = _clipped(left, rest, max_step, DAMPING + ca.fmin(MOST_DAMPING, DAMPING_RATE * square))
     following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
-    return ca.Function("ik", [q_sx, p_sx], [ca.vertcat(*following), ca.sqrt(square)])
+    given = [q_sx, p_sx, held_sx] if hold else [q_sx, p_sx]
+    return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
 
 
 def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:

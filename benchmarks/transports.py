@@ -1,0 +1,117 @@
+"""Transports between any two configurations: fresh problems of four sets, planned alone and refined.
+
+* "found from the start": rows of the dataset heavy-object, whose goal configuration is the one that inverse kinematics
+  finds from the start;
+* "independent": as the dataset heavy-object-anywhere draws them, but all goals are found from guesses of their own;
+* "on joint limits": likewise, with a joint of the start or of the goal on its limit;
+* "another problem's": the goal of the next row of the dataset heavy-object, where both ends are free of collision.
+
+No joint is farther from start to goal than 165 degrees: beyond, some tasks have no solution. Nothing was chosen by
+these seeds. The clock is CPU time, one BLAS thread. Goals stand beside the figures.
+
+    python benchmarks/transports.py
+    python benchmarks/transports.py --problems 1000 --refined 300 --models heavy-object-anywhere heavy-object
+"""
+
+import argparse
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from common import arguments, progress, report, table
+from numpy.typing import NDArray
+from onthefly import Goals, measure, rows_of
+
+import cnpgen
+from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.complete import complete
+from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.pipelines.stages.ik import GoalIK, StartIK
+from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.planner.planner import Planner
+from cnpgen.problems.robot import load_robot
+from cnpgen.trajectory.boundary import Boundary
+
+OLD, NEW = "heavy-object", "heavy-object-anywhere"
+SPARE = 8  # drawn for each that is wanted of sets of which some are left out
+FARTHEST = np.deg2rad(165)
+GOALS = {"found from the start": 0.995, "independent": 0.9, "on joint limits": 0.9, "another problem's": 0.9}
+REFINED_VALID, OVER_REFINED = 0.995, 1.04
+
+
+def independent(at_limit: float) -> DatasetRecipe:
+    """Return the new dataset's recipe, no goal of which is found from the start."""
+    recipe = load_dataset_recipe(NEW)
+    stages = tuple(changed(stage, at_limit) for stage in recipe.pipeline.stage)
+    return replace(recipe, pipeline=replace(recipe.pipeline, stage=stages))
+
+
+def changed(stage: Stage, at_limit: float) -> Stage:
+    """Make stages that have guesses use them always, with so many joints on limits."""
+    if isinstance(stage, GoalIK):
+        return replace(stage, at_limit=at_limit, from_start=0.0)
+    return replace(stage, at_limit=at_limit) if isinstance(stage, StartIK) else stage
+
+
+def on_limits(boundary: Boundary) -> NDArray[np.bool_]:
+    """Say which problems have a joint on a limit at the start or at the goal."""
+    robot = load_robot(cnpgen.load_problem(OLD))
+    ends = np.concatenate([boundary.start_q, boundary.goal_q], axis=1)
+    low, high = np.tile(robot.position_lower, 2), np.tile(robot.position_upper, 2)
+    return np.asarray(((ends == low) | (ends == high)).any(axis=1))
+
+
+def to_goals_of_others(count: int, seed: int) -> Boundary:
+    """Problems from the start of one row to the goal configuration of the next."""
+    rows = draw_boundary_problems(OLD, SPARE * count, seed=seed).boundary
+    found = complete(OLD, start_q=rows.start_q, goal_q=np.roll(rows.goal_q, 1, axis=0)).plans.boundary
+    near = np.abs(found.goal_q - found.start_q).max(axis=1) <= FARTHEST
+    return found[np.flatnonzero(near)[:count]]
+
+
+def sets(count: int, seed: int) -> dict[str, Boundary]:
+    """Make the four sets."""
+    limits = draw_boundary_problems(independent(at_limit=0.5), SPARE * count, seed=seed + 2).boundary
+    return {
+        "found from the start": draw_boundary_problems(OLD, count, seed=seed).boundary,
+        "independent": draw_boundary_problems(independent(at_limit=0.0), count, seed=seed + 1).boundary,
+        "on joint limits": limits[np.flatnonzero(on_limits(limits))[:count]],
+        "another problem's": to_goals_of_others(count, seed + 3),
+    }
+
+
+def goals_of(name: str) -> Goals:
+    """Say what is wanted of a set."""
+    return {
+        "valid alone": (GOALS[name], False),
+        "valid refined": (REFINED_VALID, False),
+        "T / refined": (OVER_REFINED, True),
+    }
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument("--models", nargs="+", default=[NEW], help="shipped ones or files")
+    parser.add_argument("--problems", type=int, default=300, help="of each set")
+    parser.add_argument("--refined", type=int, default=60, help="how many of them are refined")
+    parser.add_argument("--seed", type=int, default=246_813_579, help="of the problems")
+
+
+def main() -> None:
+    """Run."""
+    chosen = arguments(__doc__, options)
+    problems, results, rows = sets(chosen.problems, chosen.seed), dict[str, Any](), []
+    for model in chosen.models:
+        planner = Planner(model)
+        for name, boundary in problems.items():
+            progress(f"{model}: {name}")
+            found = measure(planner, boundary, chosen.refined)
+            results.setdefault(model, {})[name] = found
+            rows += rows_of(model, name, found, goals_of(name))
+    head = ("planner", "problems", "figure", "value", "goal", "")
+    report({"transports": results}, [table("transports", head, rows, left=3)], as_json=chosen.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Runs that start from a model: its parameters and features are the first ones, and what does not fit is refused."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.make.dataset import make_dataset
+from cnpgen.planner.model_file import save_model
+from cnpgen.problems.record import record_problem
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.training.train import Trained, train_model
+from tests.conftest import tiny_recipe
+from tests.examples.models import SMALL
+from tests.examples.plans import PROBLEMS
+
+STILL = replace(SMALL, learning_rate=1e-12)  # so slow that nothing moves
+
+
+@pytest.fixture(scope="module")
+def first(tiny: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """A model of replans, trained for a moment; not to be changed."""
+    out = tmp_path_factory.mktemp("first") / "first.h5"
+    return train_model(tiny("airhockey-replan"), out, steps=5, settings=SMALL, check_rows=1, workers=1)
+
+
+def test_the_first_parameters_and_the_features_are_those_of_the_model(first, tmp_path):
+    rows, out = tmp_path / "rows", tmp_path / "next.h5"
+    make_dataset(tiny_recipe("airhockey-replan", seed=9), rows, workers=1)
+    found = train_model(rows, out, steps=1, settings=STILL, start_from=first.path, check_rows=1, workers=1)
+    np.testing.assert_allclose(found.model.parameters, first.model.parameters, atol=1e-9)
+    np.testing.assert_array_equal(found.model.features.mean, first.model.features.mean)
+    np.testing.assert_array_equal(found.model.features.scale, first.model.features.scale)
+    assert found.model.training["start_from"] == file_sha256(first.path)
+    with pytest.raises(UsageError, match=re.escape("is another model, it differs in start_from")):
+        train_model(rows, out, steps=1, settings=STILL, check_rows=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "said"),
+    [
+        ("airhockey-replan", replace(SMALL, hidden=17), "hidden is 16 there and 17 here"),
+        ("airhockey-replan", replace(SMALL, path_scale=1.0), "path_scale is 0.5 there and 1.0 here"),
+        ("airhockey-hit", SMALL, "zero conditions is () there and ('start_dq', 'start_ddq') here"),
+    ],
+    ids=["width", "meaning", "rest"],
+)
+def test_a_model_that_does_not_fit_is_refused(first, tiny, tmp_path, name, settings, said):
+    with pytest.raises(UsageError, match=re.escape(said)):
+        train_model(tiny(name), tmp_path / "next.h5", steps=1, settings=settings, start_from=first.path, check_rows=1)
+
+
+def test_a_model_for_another_problem_is_refused(first, tiny, tmp_path):
+    problem, other = PROBLEMS["airhockey"], tmp_path / "other.h5"
+    slower = record_problem(replace(problem, limits=replace(problem.limits, velocity_scale=0.7)))
+    save_model(other, replace(first.model, problem=slower))
+    with pytest.raises(UsageError, match="the model to start from is for another problem"):
+        train_model(tiny("airhockey-replan"), tmp_path / "next.h5", steps=1, start_from=other)
