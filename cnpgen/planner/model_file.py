@@ -66,7 +66,8 @@ def load_model(name_or_path: str | Path) -> Model:
 
 def shipped_models() -> dict[str, Path]:
     """List the models that cnpgen ships: name -> file, by name."""
-    return {path.stem: path for path in sorted((recipes_root() / "datasets" / "models").glob("*.h5"))}
+    found = (recipes_root() / "datasets" / "models").glob("*.h5")
+    return {path.stem: path for path in sorted(found, key=lambda path: path.stem)}
 
 
 def find_model(name_or_path: str | Path) -> Path:
