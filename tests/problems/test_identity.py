@@ -23,7 +23,8 @@ from tests.examples.constraints import TipSpeed
 from tests.examples.models import untrained_model
 
 SHIPPED = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
-LABELS = {"title", "robot.urdf", "robot.srdf"}  # what it is called and where files lie: what is in them counts
+# What it is called, where files lie and how they are read: what is in them counts.
+LABELS = {"title", "robot.urdf", "robot.srdf", "robot.convex_parts"}
 
 
 PROBLEMS = {

@@ -127,6 +127,7 @@ def test_a_busy_moment_does_not_make_a_run_short(monkeypatch):
         learner=SimpleNamespace(settings=TrainingSettings(), architecture=Architecture(**dict.fromkeys(SIZES, 2))),
         names=("time", "table"),
         metric=Metric([1.0], [0.0]),
+        first=None,
         step=step,
     )
     monkeypatch.setattr("cnpgen.training.prepare.time.process_time", lambda: now[0])

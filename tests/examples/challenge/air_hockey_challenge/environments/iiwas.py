@@ -17,7 +17,7 @@ def model() -> mujoco.MjModel:
     problem = load_problem("airhockey")
     text = scene_xml(Scene(problem, load_robot(problem), PLANTS["nominal"], np.zeros(0), np.array([1.0, 0.0])))
     for number in range(1, 7):
-        text = text.replace(f'joint name="joint_{number}"', f'joint name="iiwa_1/joint_{number}"')
+        text = text.replace(f'joint name="joint {number}"', f'joint name="iiwa_1/joint_{number}"')
     for axis in "xy":
         text = text.replace(f'joint name="puck {axis}"', f'joint name="puck_{axis}"')
     idle = '<body pos="0 0 9" gravcomp="1"><joint name="iiwa_1/joint_7" type="hinge"/><inertial pos="0 0 0" mass="1"'
