@@ -313,6 +313,7 @@ def test_a_change_beside_a_recipe_is_seen(tmp_path):
     assert stamp([file]) != before
 
 
+@pytest.mark.slow
 @needs_meshcat
 @needs_chromium
 def test_a_browser_runs_the_page_that_is_served(plans):

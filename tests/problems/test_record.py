@@ -19,6 +19,7 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import as_problem, as_record, open_problem
 from cnpgen.trajectory.boundary import Boundary
+from tests.conftest import some
 from tests.examples.shaped_robot import write_problem
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +91,7 @@ def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
         assert len(str(caught.value)) < 200
 
 
-@pytest.mark.parametrize("given", [HEAVY, RECORD, "heavy-object"])
+@pytest.mark.parametrize("given", some([RECORD, HEAVY, "heavy-object"], 1, "slow"))
 def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Problem) -> None:
     loss, omega = PlanLoss(given), Omega(given, landing_steps=0)  # whose kernels would be long to compile
     q = np.tile(HEAVY.robot.base, (2, 1))

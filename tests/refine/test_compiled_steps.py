@@ -14,6 +14,7 @@ from cnpgen.refine.solver import compiled, quadratic
 from cnpgen.refine.solver.compiled import CompiledSteps
 from cnpgen.refine.solver.quadratic import Near, PlainSteps
 from cnpgen.trajectory.boundary import Boundary
+from tests.conftest import some
 from tests.examples.plans import Plan, load
 from tests.examples.refiner import library, needs_compiler, task
 
@@ -37,7 +38,7 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("held", [False, True], ids=["goal acceleration free", "goal acceleration held"])
-@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("label", some(LABELS, 1, "slow"))
 def test_values_and_steps_are_those_of_numpy_and_daqp(label: str, held: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     exact(monkeypatch)
     plan = load(label)

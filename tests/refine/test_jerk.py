@@ -30,6 +30,7 @@ def jerky_refiner(name: str) -> Refiner:
     return Refiner(problem, robot, kernels=kernels, world=World(robot, problem.obstacle, problem.object_size))
 
 
+@pytest.mark.slow
 def test_gradients_of_residuals_with_jerks_are_those_of_finite_differences() -> None:
     plan, tool = jerky_plan("hit"), jerky_refiner("airhockey")
     grid = make_grid(tool.spec, 24, plan.problem.path_orders)

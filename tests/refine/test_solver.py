@@ -342,6 +342,7 @@ def test_an_iterate_lands_once_its_objective_has_settled(monkeypatch: pytest.Mon
     assert landed.cost < 1.003 * wandered.cost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", LABELS)
 def test_a_refused_step_is_never_tried_again_as_it_was(label: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = load(label)

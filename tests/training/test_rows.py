@@ -10,11 +10,13 @@ from cnpgen.training.data import open_training_data
 from cnpgen.training.prepare import prepare_run
 from cnpgen.training.rows import StepRows, prepare_rows
 from cnpgen.training.settings import METRICS, TrainingSettings
-from tests.conftest import columns_of
+from tests.conftest import columns_of, some
 from tests.examples.models import boundary_of_columns, meaning_of, surroundings_of
 
 
-@pytest.mark.parametrize(("dataset", "name"), [("airhockey-replan", "airhockey"), ("heavy-object", "heavy-object")])
+@pytest.mark.parametrize(
+    ("dataset", "name"), some([("airhockey-replan", "airhockey"), ("heavy-object", "heavy-object")], 1, "slow")
+)
 def test_rows_prepared_in_blocks_are_those_prepared_at_once(tiny, monkeypatch, dataset, name):
     boundary = boundary_of_columns(columns_of(tiny(dataset)), 50)
     prepare = make_kit(surroundings_of(name), meaning_of(1, 1), slow_down=False).prepare
