@@ -219,7 +219,8 @@ def main() -> None:
     curves = {name: curve(name, chosen.seed, curved) for name in models if curved}
     lines = [(name, *(f"{value:.4f}" for value in values.values())) for name, values in curves.items()]
     steps = [f"{step} step{'s' if step > 1 else ''}" for step in STEPS]
-    tables.append(table("motion time over that after as many steps as it takes", ("planner", *steps), lines))
+    if curves:
+        tables.append(table("motion time over that after as many steps as it takes", ("planner", *steps), lines))
     again = []
     if REPLANNER in models and curved:
         again = replan(REPLANNER, chosen.seed, SHORT["planned"], SHORT["refined"])

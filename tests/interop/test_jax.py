@@ -268,7 +268,7 @@ def test_jitted_functions_take_tasks_with_an_acceleration_at_the_goal(arriving: 
 
 
 def test_control_points_meet_the_boundary_conditions(omega: Omega) -> None:
-    given = boundary(omega.problem.name, 2)
+    given = asked_of(omega, 2)
     wanted = (given.start_q, given.start_dq, given.start_ddq, given.goal_q, given.goal_dq)
     with x64():
         path, rate = control_points(omega, omega.tasks(given), *map(jax.numpy.asarray, outputs(omega, 2)))
@@ -282,7 +282,7 @@ def test_control_points_meet_the_boundary_conditions(omega: Omega) -> None:
 
 @pytest.mark.parametrize("jitted", [True, False])
 def test_the_gradients_of_control_points_are_those_of_differences(omega: Omega, jitted: bool) -> None:
-    tasks, said, random = omega.tasks(boundary(omega.problem.name, 3)), outputs(omega, 3), np.random.default_rng(2)
+    tasks, said, random = omega.tasks(asked_of(omega, 3)), outputs(omega, 3), np.random.default_rng(2)
 
     def value(tasks: Any, *said: Any) -> Any:
         path, rate = control_points(omega, tasks, *said)
@@ -329,6 +329,6 @@ def test_a_layer_learns_through_control_points_and_loss_although_a_plan_overflow
 
 
 def test_outputs_of_another_width_are_refused_when_the_function_is_traced(omega: Omega) -> None:
-    tasks, (phi, log_rate) = omega.tasks(boundary(omega.problem.name, 2)), outputs(omega, 2)
+    tasks, (phi, log_rate) = omega.tasks(asked_of(omega, 2)), outputs(omega, 2)
     with pytest.raises(UsageError, match=r"log_rate must have shape \(2, 20\), got \(2, 19\)"):
         jax.eval_shape(lambda phi, log_rate: control_points(omega, tasks, phi, log_rate), phi, log_rate[:, 1:])

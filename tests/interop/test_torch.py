@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.examples.loader import ALL, columns, ids, make
-from tests.examples.plans_of_networks import asked_of, at_ends, boundary, outputs
+from tests.examples.plans_of_networks import asked_of, at_ends, outputs
 
 torch = pytest.importorskip("torch")
 
@@ -519,7 +519,7 @@ def test_boundary_conditions_may_be_tensors(omega: Omega) -> None:
     ("dtype", "expected"), [("bfloat16", "float32"), ("float32", "float32"), ("float64", "float64")]
 )
 def test_control_points_have_at_least_single_precision(omega: Omega, dtype: str, expected: str) -> None:
-    tasks = omega.tasks(boundary(omega.problem.name, 2))
+    tasks = omega.tasks(asked_of(omega, 2))
     said = [torch.tensor(part, dtype=getattr(torch, dtype)).requires_grad_() for part in outputs(omega, 2)]
     path, rate = control_points(omega, tasks, *said)
     assert path.dtype == rate.dtype == getattr(torch, expected)
@@ -528,7 +528,7 @@ def test_control_points_have_at_least_single_precision(omega: Omega, dtype: str,
 
 
 def test_functional_gradients_of_control_points_are_the_same_and_second_ones_are_refused(omega: Omega) -> None:
-    tasks, (phi, log_rate) = omega.tasks(boundary(omega.problem.name, 2)), map(torch.tensor, outputs(omega, 2))
+    tasks, (phi, log_rate) = omega.tasks(asked_of(omega, 2)), map(torch.tensor, outputs(omega, 2))
 
     def scalar(phi: Any) -> Any:
         return (control_points(omega, tasks, phi, log_rate)[0] ** 2).sum()
@@ -540,7 +540,7 @@ def test_functional_gradients_of_control_points_are_the_same_and_second_ones_are
 
 
 def test_a_network_learns_through_control_points_and_loss_although_a_plan_overflows(omega: Omega, loss: Any) -> None:
-    of, tasks = loss(omega.problem.name, "float32"), omega.tasks(boundary(omega.problem.name, 4))
+    of, tasks = loss(omega.problem.name, "float32"), omega.tasks(asked_of(omega, 4))
     torch.manual_seed(0)
     network = torch.nn.Linear(4, omega.path_outputs + omega.rate_outputs)
     torch.nn.init.normal_(network.weight, std=1e-2)
