@@ -15,7 +15,7 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import Landing, make_landing
-from cnpgen.planner.model import Model, begins_and_ends_at_rest
+from cnpgen.planner.model import Meaning, Model, begins_and_ends_at_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
@@ -105,15 +105,19 @@ def _check_first(
     if first.problem.comparable_sha256 != given.record.comparable_sha256:
         differs = ", ".join(given.record.differences(first.problem)[:4])
         raise UsageError(f"the model to start from is for another problem, they differ in {differs}")
-    meaning = settings.meaning
-    theirs = {**asdict(first.architecture), "path_scale": first.meaning.path_scale, "zero conditions": first.rest}
-    ours = {**asdict(architecture), "path_scale": meaning.path_scale, "zero conditions": rest}
-    theirs["expected_time"], ours["expected_time"] = first.meaning.expected_time, meaning.expected_time
+    theirs = _said(first.architecture, first.meaning, first.rest)
+    ours = _said(architecture, settings.meaning, rest)
     changed = [
         f"{name} is {theirs[name]!r} there and {ours[name]!r} here" for name in ours if theirs[name] != ours[name]
     ]
     if changed:
         raise UsageError(f"the model to start from does not fit: {', '.join(changed)}")
+
+
+def _said(architecture: Architecture, meaning: Meaning, rest: tuple[str, ...]) -> dict[str, Any]:
+    """Return what must be the same for parameters to mean the same."""
+    about = {"path_scale": meaning.path_scale, "zero conditions": rest, "expected_time": meaning.expected_time}
+    return {**asdict(architecture), **about}
 
 
 def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Boundary, *, inputs: int) -> Architecture:

@@ -6,12 +6,15 @@ and what has its three corners in a convex body is in it.
 """
 
 import hashlib
+import io
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +31,7 @@ ACROSS = 5e-3  # m: a triangle that reaches further out of every part is cut in 
 CUTS = 12  # at most
 PATIENCE = 900.0  # s: CoACD takes some ten seconds for a link
 SEED = 1
+REVISION = 1  # of how triangles are dealt out: what was kept of another one is not read
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
@@ -37,7 +41,7 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
         points: Its points [m], shape (N, 3).
         triangles: Its triangles as numbers of points, shape (T, 3).
         most: How many parts there may be.
-        keep: Folder in which CoACD's answers are kept; None to keep nothing.
+        keep: Folder in which parts are kept, since they take up to a minute to find; None to keep nothing.
 
     Returns:
         The corners of each part [m], shape (V, 3); those of the hull where parts are hardly smaller.
@@ -47,11 +51,33 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
         RecipeError: CoACD cannot take the mesh apart.
     """
     whole = hull_corners(points)
-    corners = points[triangles]
-    if most == 1 or _volume_of_hull(whole) <= CONVEX * abs(np.linalg.det(corners).sum()) / 6:
+    if _volume_of_hull(whole) <= CONVEX * abs(np.linalg.det(points[triangles]).sum()) / 6:
         return [whole]
-    parts = dealt_out(corners, [hull_corners(part) for part in _taken_apart(points, triangles, most, keep)])
-    return parts if sum(map(_volume_of_hull, parts)) < SMALLER * _volume_of_hull(whole) else [whole]
+    points, same = np.unique(points, axis=0, return_inverse=True)  # STL has the points of every triangle anew
+    triangles = same.reshape(-1)[triangles]
+    name = f"parts-{_identity(points, triangles, most)}.npz"
+    kept = None if keep is None else keep / name
+    if kept is not None:
+        with suppress(OSError, ValueError, KeyError):
+            return _read(kept)
+    parts = dealt_out(points[triangles], [hull_corners(part) for part in _taken_apart(points, triangles, most)])
+    if sum(map(_volume_of_hull, parts)) >= SMALLER * _volume_of_hull(whole):
+        parts = [whole]
+    if kept is not None:
+        with suppress(MachineError):
+            write_file(kept, _written(parts))
+    return parts
+
+
+def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
+    """Return a digest of all that the parts depend on."""
+    try:
+        version = metadata.version("coacd")
+    except metadata.PackageNotFoundError as error:
+        raise MachineError("robot.convex_parts needs CoACD: pip install 'cnpgen[decompose]'") from error
+    numbers = b"".join(np.ascontiguousarray(each).tobytes() for each in (points, triangles.astype("<i8")))
+    about = f"{REVISION} {version} {most} {SEED} {len(points)} "
+    return hashlib.sha256(about.encode() + numbers).hexdigest()[:32]
 
 
 def dealt_out(triangles: Array, parts: list[Array]) -> list[Array]:
@@ -95,36 +121,28 @@ def _volume_of_hull(corners: Array) -> float:
     return float(ConvexHull(corners).volume)
 
 
-def _taken_apart(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
+def _taken_apart(points: Array, triangles: NDArray[np.int64], most: int) -> list[Array]:
     """Return the points of CoACD's parts [m]; it runs in a process of its own, as Pinocchio cannot bear it in one."""
-    try:
-        version = metadata.version("coacd")
-    except metadata.PackageNotFoundError as error:
-        raise MachineError("robot.convex_parts needs CoACD: pip install 'cnpgen[decompose]'") from error
-    points, same = np.unique(points, axis=0, return_inverse=True)  # STL has the points of every triangle anew
-    triangles = same.reshape(-1)[triangles]
-    numbers = b"".join(np.ascontiguousarray(each).tobytes() for each in (points, triangles.astype("<i8")))
-    key = hashlib.sha256(f"{version} {most} {SEED} {len(points)} ".encode() + numbers).hexdigest()[:32]
-    kept = None if keep is None else keep / f"parts-{key}.npz"
-    if kept is not None:
-        with suppress(OSError, ValueError, KeyError):
-            return _read(kept)
     with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
         mesh, answer = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
         np.savez(mesh, points=points, triangles=triangles, most=most)
         command = [sys.executable, "-m", "cnpgen.robots.shape.parts", str(mesh), str(answer)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-            found = _read(answer)
+            return _read(answer)
         except subprocess.TimeoutExpired as error:
             raise RecipeError([f"CoACD did not take a mesh apart in {PATIENCE:g} s"]) from error
         except (OSError, ValueError, KeyError) as error:
             said = (done.stderr or done.stdout).strip().splitlines()[-1:]
             raise RecipeError([f"CoACD cannot take a mesh apart: {' '.join(said)}"]) from error
-        if kept is not None:
-            with suppress(MachineError):
-                write_file(kept, answer.read_bytes())
-    return found
+
+
+def _written(parts: Sequence[Array]) -> bytes:
+    """Return parts as the bytes of a file that ``_read`` reads."""
+    file = io.BytesIO()
+    named: dict[str, Any] = {f"{number:04d}": part for number, part in enumerate(parts)}
+    np.savez(file, **named)
+    return file.getvalue()
 
 
 def _read(file: Path) -> list[Array]:
@@ -144,7 +162,7 @@ def _main(mesh: str, answer: str) -> None:
     with np.load(mesh) as content:
         given = coacd.Mesh(content["points"], content["triangles"])
         parts = coacd.run_coacd(given, max_convex_hull=int(content["most"]), seed=SEED)
-    np.savez(answer, **{f"{number:04d}": points for number, (points, _) in enumerate(parts)})
+    Path(answer).write_bytes(_written([points for points, _ in parts]))
 
 
 if __name__ == "__main__":
