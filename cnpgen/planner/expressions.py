@@ -80,9 +80,9 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
 
 
-def has_equalities(kernels: KernelLibrary) -> bool:
-    """Whether ``equality_residuals`` of the problem of some kernels has rows; CasADi is asked once per problem."""
-    return kernels.tape(equality_residuals).outputs[0] > 0
+def useful_steps(kernels: KernelLibrary, steps: int) -> int:
+    """How many of some steps onto the equalities are of use: none where ``equality_residuals`` has no rows."""
+    return steps if steps and kernels.tape(equality_residuals).outputs[0] > 0 else 0
 
 
 def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.curves import landed_path
-from cnpgen.planner.expressions import has_equalities
+from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
@@ -113,7 +113,7 @@ class Kit:
 
 
 def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at_goal: int = 2) -> Kit:
-    """Make the kit of a problem; without equalities there is nothing to bend onto.
+    """Make the kit of a problem.
 
     Args:
         given: The problem.
@@ -122,17 +122,16 @@ def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
     """
     problem, robot, kernels = given.problem, given.robot, given.kernels
-    bent = has_equalities(kernels)
     with kernels.compiling_together():
         prepare = prepare_tasks(
             problem,
             robot,
             kernels,
-            bending_steps=meaning.bending_steps if bent else 0,
+            bending_steps=meaning.bending_steps,
             expected_time=meaning.expected_time,
             fixed_at_goal=fixed_at_goal,
         )
-        landing_steps = meaning.landing_steps if bent else 0
+        landing_steps = useful_steps(kernels, meaning.landing_steps)
         path = kernels.load(landed_path, steps=landing_steps, fixed_at_goal=fixed_at_goal)
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
     return Kit(prepare, path, slowing)

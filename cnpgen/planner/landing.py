@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.curves import path_bend, path_bend_adjoint
+from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.preparation import lanes
 from cnpgen.problems.problem import Problem
 
@@ -62,15 +63,17 @@ class Landing:
         return found
 
 
-def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2) -> Landing:
-    """Load the landing of a problem that has equalities.
+def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2) -> Landing | None:
+    """Load the landing of a problem; None where there are no steps or no equalities.
 
     Args:
         problem: The problem.
         kernels: Where kernels are loaded from.
-        steps: Number of Gauss-Newton steps, at least 1.
+        steps: Number of Gauss-Newton steps.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
     """
+    if not useful_steps(kernels, steps):
+        return None
     interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal)
     return Landing(load(path_bend), load(path_bend_adjoint), interior)

@@ -16,7 +16,6 @@ from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.landing import Landing, make_landing
 from cnpgen.planner.preparation import Preparation, prepare_tasks
 from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
@@ -99,18 +98,15 @@ class Omega:
     @cached_property
     def _built(self) -> tuple[Preparation, Landing | None]:
         robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
-        bent = has_equalities(kernels)
         with kernels.compiling_together():
             prepare = prepare_tasks(
                 problem,
                 robot,
                 kernels,
-                bending_steps=self._bending if bent else 0,
+                bending_steps=self._bending,
                 expected_time=self._time,
                 fixed_at_goal=self._fixed,
             )
-            if not bent or not self._landed:
-                return prepare, None
             return prepare, make_landing(problem, kernels, steps=self._landed, fixed_at_goal=self._fixed)
 
     @one_thread()

@@ -11,6 +11,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.planner.curves import line_bend
+from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
@@ -94,10 +95,11 @@ def prepare_tasks(
         problem: The problem.
         robot: Its robot.
         kernels: Where kernels are loaded from.
-        bending_steps: Gauss-Newton steps that bend the line; 0, as where there are no equalities, leaves it straight.
+        bending_steps: Gauss-Newton steps that bend the line; it stays straight where there are no equalities.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
     """
-    line = kernels.load(line_bend, steps=bending_steps, fixed_at_goal=fixed_at_goal) if bending_steps else None
+    steps = useful_steps(kernels, bending_steps)
+    line = kernels.load(line_bend, steps=steps, fixed_at_goal=fixed_at_goal) if steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
     return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)

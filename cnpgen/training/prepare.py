@@ -12,9 +12,8 @@ from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.expressions import has_equalities
 from cnpgen.planner.kit import Kit, Surroundings, make_kit
-from cnpgen.planner.landing import Landing, make_landing
+from cnpgen.planner.landing import make_landing
 from cnpgen.planner.model import Meaning, Model, begins_and_ends_at_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.store.files.documents import plain
@@ -67,8 +66,9 @@ def prepare_run(
     architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
     if first is not None:
         _check_first(first, architecture, settings, given, rest)
+    landing = make_landing(given.problem, given.kernels, steps=settings.landing_steps, fixed_at_goal=fixed)
     run = Run(
-        learner=Learner(architecture, spec, loss, settings, _landing(given, settings, fixed)),
+        learner=Learner(architecture, spec, loss, settings, landing),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
@@ -129,12 +129,6 @@ def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Bou
         path_outputs=given.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),
         rate_outputs=spec.rate_control_points,
     )
-
-
-def _landing(given: Surroundings, settings: TrainingSettings, fixed_at_goal: int) -> Landing | None:
-    if settings.landing_steps == 0 or not has_equalities(given.kernels):
-        return None
-    return make_landing(given.problem, given.kernels, steps=settings.landing_steps, fixed_at_goal=fixed_at_goal)
 
 
 def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
