@@ -1,6 +1,7 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,6 +84,7 @@ class PathWorld:
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
+        self._pairs: dict[str | int, PairDistances] = {}
         self._object_distances: list[Array] | None = None
         self._solids = solids_of(self.obstacles, tops)
         self._scene.place(self._solids)
@@ -149,6 +151,9 @@ class PathWorld:
 
     def segment_pairs(self) -> PairDistances:
         """Tell the signed distances of every segment of the robot's skeleton from every obstacle, one by one."""
+        return self._once("segments", self._from_segments)
+
+    def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids
         ends = [(segment, solid) for segment in segments for solid in solids]
         corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
@@ -178,7 +183,7 @@ class PathWorld:
     def shape_pairs(self) -> PairDistances:
         """Tell the signed distances of every moving piece of the robot's shape from every obstacle, one by one."""
         bodies = self._placed_bodies()
-        return bodies.between(bodies.from_obstacles)
+        return self._once("shape", lambda: bodies.between(bodies.from_obstacles))
 
     def self_distances(self) -> list[Array]:
         """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
@@ -188,7 +193,13 @@ class PathWorld:
     def self_pairs(self) -> PairDistances:
         """Tell the signed distances of every two pieces of the robot's shape that must not touch."""
         bodies = self._placed_bodies()
-        return bodies.between(bodies.among_links)
+        return self._once("self", lambda: bodies.between(bodies.among_links))
+
+    def _once(self, what: str | int, make: Callable[[], PairDistances]) -> PairDistances:
+        """Return what was made since the robot moved, or make it."""
+        if what not in self._pairs:
+            self._pairs[what] = make()
+        return self._pairs[what]
 
     def clear_of_obstacles(self, least: float) -> NDArray[np.bool_]:
         """Say at which states all moving pieces of the robot's shape are so far from all obstacles [m], shape (K,)."""
@@ -234,14 +245,14 @@ class PathWorld:
         """
         if self._object_distances is None:
             self._require_object()
-            pairs = [self._from_object(index) for index in range(len(self._solids))]
+            pairs = self._object_from_each()
             found = [each.smallest()[0] for each in pairs] if self._is_somewhere() else self._unknown(len(pairs))
             self._object_distances = found
         return self._object_distances
 
     def object_pairs(self) -> PairDistances:
         """Tell the signed distances of the held object from every obstacle."""
-        pairs = [self._from_object(index) for index in range(len(self._solids))]
+        pairs = self._object_from_each()
         bounds = np.concatenate([np.empty((0, self.q.shape[1])), *(each.bounds for each in pairs)])
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
@@ -250,7 +261,10 @@ class PathWorld:
         def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
             return pairs[pair].separate(0, direction, which)
 
-        return PairDistances(bounds, measure, separate)
+        return PairDistances(bounds, measure, separate, {i: each.known.get(0, []) for i, each in enumerate(pairs)})
+
+    def _object_from_each(self) -> list[PairDistances]:
+        return [self._once(index, partial(self._from_object, index)) for index in range(len(self._solids))]
 
     def _from_object(self, index: int) -> PairDistances:
         """Tell the signed distances of the held object from one obstacle."""

@@ -65,7 +65,7 @@ def look_closer(survey: Survey, *, brief: bool) -> Iterator[tuple[Measured, Marg
 
     Args:
         survey: A motion whose world is at its samples; it is moved.
-        brief: Whether to look only where more may hide than is allowed.
+        brief: Whether to look only where it matters to whether contacts are as deep as is allowed, or to how much more.
     """
     contacts = [each for each in survey.measured if is_contact(each.constraint)]
     if not contacts:
@@ -83,7 +83,7 @@ def _divisions(
     """Yield phases in ever shorter intervals, and the contacts there."""
     for level in range(LEVELS):
         chosen = intervals.hiding()
-        if level < DEEPER and not brief:
+        if level < DEEPER and not (brief and intervals.room.min() >= 0):
             chosen |= intervals.deepest()
         if not chosen.any():
             return

@@ -91,8 +91,8 @@ class Judge:
     ) -> list[Verdict]:
         """Judge N plans; arguments as of ``judge``.
 
-        A brief verdict has neither metrics nor the paper's rule. Of a valid plan it has the margins at samples that are
-        fewer; whether a plan is valid depends on no samples.
+        A brief verdict has neither metrics nor the paper's rule. It is from fewer samples, on which it does not depend
+        whether a plan is valid; how much room conditions have is less exact.
         """
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
         with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
@@ -167,13 +167,9 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
             raise UsageError(f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {found}")
 
 
-def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool, sparse: bool = False) -> Verdict:
+def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
-    if brief and not sparse:
-        quick = _judge_plan(plan, world, step, brief=True, sparse=True)
-        if quick.valid or not quick.margins:
-            return quick
-    found = _samples(plan, step, sparse=sparse)
+    found = _samples(plan, step, sparse=brief)
     if isinstance(found, Verdict):
         return found
     samples, table = found
