@@ -4,7 +4,7 @@ The second measures every constraint at every moment of the time grid, and looks
 time is the median over repetitions of the mean over all plans; both ways take turns on the plans that they share.
 
 With ``--always N``, N plans of each file are made to lie at a tolerance, a hundred-thousandth of it on either side, and
-judged at ever finer steps: whether they are valid must not depend on the step.
+judged at ever finer steps, and as briefly as the refiner judges them: whether they are valid must not depend on the step.
 
     cnpgen solve airhockey-hit --n 100 -o hits.h5
     python benchmarks/verdict.py hits.h5 --always 100
@@ -20,6 +20,7 @@ from common import arguments, median, report, table, verdict
 
 from cnpgen.judges.plans import Margin, Reason, Verdict, judge
 from cnpgen.judges.plans.course import course
+from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.sampling import sample, time_table
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.problems.obstacles import obstacle_tops
@@ -114,7 +115,7 @@ class Always:
     Attributes:
         problem: Name of the problem.
         plans: Number of plans.
-        differ: How many of them are valid at one step and not at another.
+        differ: How many of them are valid at one step, or as briefly as the refiner looks, and not at another.
     """
 
     problem: str
@@ -123,11 +124,12 @@ class Always:
 
 
 def at_the_tolerance(problem: Problem, margin: Margin, by: float) -> Problem:
-    """Return the problem in which one condition allows the share ``by`` more than is exceeded, all others anything."""
+    """Return the problem in which one constraint allows the share ``by`` more than is exceeded, and there is no other."""
     share = margin.excess / margin.allowed * (1 + by)
-    tolerances = [each.tolerance * (share if each.reason == margin.reason else 1e3) for each in problem.constraint]
-    changed = [replace(each, tolerance=new) for each, new in zip(problem.constraint, tolerances, strict=True)]
-    return replace(problem, constraint=tuple(changed))
+    only = [
+        replace(each, tolerance=each.tolerance * share) for each in problem.constraint if each.reason == margin.reason
+    ]
+    return replace(problem, constraint=tuple(only))
 
 
 def always(plans: Plans, count: int, seed: int) -> Always:
@@ -148,7 +150,8 @@ def always(plans: Plans, count: int, seed: int) -> Always:
             near = at_the_tolerance(near, judge(near, robot, *rest, step=STEP)[0].margins[name], 0.0)
         by = NEAR if k % 2 else -NEAR
         last = at_the_tolerance(near, judge(near, robot, *rest, step=STEP)[0].margins[name], by)
-        differ += len({judge(last, robot, *rest, step=step)[0].valid for step in STEPS}) > 1
+        said = {judge(last, robot, *rest, step=step)[0].valid for step in STEPS}
+        differ += len(said | {Judge(last, robot)(*rest, brief=True)[0].valid}) > 1
     return Always(plans.problem.name, count, differ)
 
 

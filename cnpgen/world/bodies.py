@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.shape.hull import CUBE, ball_round
+from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Solid, same_shape
 from cnpgen.world.certified import CertifiedDistance, body
-from cnpgen.world.clear import clear_states
-from cnpgen.world.sweep import sweep
+from cnpgen.world.pairs import PairDistances
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
@@ -31,7 +30,7 @@ class Bodies:
 
     Attributes:
         from_obstacles: Pairs (obstacle, moving piece), piece by piece, shape (M, 2).
-        among_links: Pairs of pieces of links that must not touch, shape (M, 2).
+        among_links: Pairs of pieces of links that must not touch, the one nearer to the base first, shape (M, 2).
     """
 
     def __init__(self, shape: Shape, n_obstacles: int, n_joints: int) -> None:
@@ -42,8 +41,7 @@ class Bodies:
         moving = [index for index, frame in enumerate(self._frames[:n_pieces]) if frame]
         obstacles = range(n_pieces, n_pieces + n_obstacles)
         self.from_obstacles = _pairs((obstacle, piece) for piece in moving for obstacle in obstacles)
-        self.among_links = _pairs(shape.apart)
-        self._holding = [_holding(shape, joint) for joint in sorted(set(shape.joints.values()) - {0})]
+        self.among_links = _pairs(sorted(pair, key=self._frames.__getitem__) for pair in shape.apart)
         self._coal = CertifiedDistance()
         self._stand([])
 
@@ -72,52 +70,26 @@ class Bodies:
         boxes = [((low + high) / 2, 0.0, (high - low) / 2 + radius) for low, high, radius in ends]
         self._centres, self._reach, self._half = map(np.array, zip(*self._balls, *boxes, strict=True))
 
-    def distances(self, pairs: Pairs) -> list[Array]:
-        """Measure the signed distances of pairs of bodies [m]; minus the depth where they overlap.
+    def between(self, pairs: Pairs) -> PairDistances:
+        """Tell the signed distances of pairs of bodies; minus the depth where they overlap.
 
         Args:
             pairs: ``from_obstacles`` or ``among_links``.
-
-        Returns:
-            Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
-        """
-        count = self._positions.shape[-1]
-        if not (np.isfinite(self._positions).all() and np.isfinite(self._rotations).all()):
-            return [np.full(count, np.nan) for _ in pairs]
-        bounds, ends = self._bounds(pairs), [(int(a), int(b)) for a, b in pairs]
-
-        def measure(pair: int, k: int) -> tuple[float, Array]:
-            return self._measure(*ends[pair], k)
-
-        def separate(pair: int, direction: Array) -> Array:
-            return self._apart(*ends[pair], direction) if count > 1 else bounds[pair]  # one state is measured already
-
-        return list(sweep(bounds, measure, separate))
-
-    def clear(self, pairs: Pairs, least: float) -> NDArray[np.bool_]:
-        """Say at which states all pairs of bodies are at least ``least`` [m] apart, shape (K,).
-
-        Args:
-            pairs: ``from_obstacles`` or ``among_links``.
-            least: The distance.
         """
         ends = [(int(a), int(b)) for a, b in pairs]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._measure(*ends[pair], k)
 
-        def separate(pair: int, direction: Array, which: Pairs) -> Array:
+        def separate(pair: int, direction: Array, which: "slice | Pairs" = slice(None), /) -> Array:
             return self._apart(*ends[pair], direction, which)
 
-        return clear_states(self._bounds(pairs), least, measure, separate)
+        return PairDistances(self._bounds(pairs), measure, separate)
 
-    def corners(self) -> Array:
-        """Compute corners of boxes that hold what every joint moves [m], shape (C, 3, K)."""
-        found = [
-            np.einsum("ijk,cj->cik", self._rotations[joint], corners) + self._positions[joint]
-            for joint, corners in self._holding
-        ]
-        return np.concatenate(found)
+    def spread(self, joint: int) -> float:
+        """How far from a joint's origin what it moves reaches at most [m]."""
+        mine = [ball for frame, ball in zip(self._frames, self._balls, strict=False) if frame == joint]
+        return max((float(np.linalg.norm(centre) + radius) for centre, radius, _ in mine), default=0.0)
 
     def _bounds(self, pairs: Pairs) -> Array:
         """Bound distances from below by balls round the bodies, and by an obstacle's faces, shape (M, K)."""
@@ -146,14 +118,6 @@ class Bodies:
         between = self._positions[other][:, which] - self._positions[frame][:, which]
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
         return np.asarray((second.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
-
-
-def _holding(shape: Shape, joint: int) -> tuple[int, Array]:
-    """Return a joint and the corners of a box that holds what it moves, in its frame [m], shape (8, 3)."""
-    moved = [piece for piece in shape.pieces if shape.joints[piece.link] == joint]
-    low = np.min([piece.vertices.min(axis=0) - piece.radius for piece in moved], axis=0)
-    high = np.max([piece.vertices.max(axis=0) + piece.radius for piece in moved], axis=0)
-    return joint, (low + high) / 2 + CUBE * (high - low)
 
 
 def _pairs(found: Any) -> Pairs:

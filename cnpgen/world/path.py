@@ -1,6 +1,7 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,16 +11,17 @@ from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.world.bodies import NO_SHAPE, Bodies
+from cnpgen.world.pairs import PairDistances
 from cnpgen.world.scene import Scene
 from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
-from cnpgen.world.sweep import sweep
-from cnpgen.world.trace import trace
+from cnpgen.world.trace import Trace
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
+Which = slice | NDArray[np.intp]
 
 
 class PathWorld:
@@ -57,7 +59,7 @@ class PathWorld:
         self.robot = robot
         self.obstacles = tuple(obstacles)
         self._model = robot.model
-        self._data = self._model.createData()
+        self._data, self._trace = self._model.createData(), Trace(self._model)
         self._pool = pin.ModelPool(self._model, 1)
         self._tip = robot.tip_frame
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
@@ -82,23 +84,20 @@ class PathWorld:
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
+        self._pairs: dict[str | int, PairDistances] = {}
         self._object_distances: list[Array] | None = None
         self._solids = solids_of(self.obstacles, tops)
         self._scene.place(self._solids)
-        self._move(with_skeleton=bool(self._solids) and self._bodies is None)
+        self._move()
 
-    def _move(self, *, with_skeleton: bool) -> None:
-        """Run the forward kinematics of every state and keep where the tip is, and the skeleton."""
-        frame, n = self._model.frames[self._tip], self.robot.n
-        used = sorted({*self._skeleton.ravel().tolist()} - {n}) if with_skeleton else []
-        joints = [frame.parentJoint, *(point + 1 for point in used)]
-        (rotation,), points = trace(self._model, self._data, self.q, joints)
-        placement = frame.placement
+    def _move(self) -> None:
+        """Run the forward kinematics of every state and keep where the joints and the tip are."""
+        frame = self._model.frames[self._tip]
+        self._rotations, self._origins = self._trace.poses(self.q)
+        rotation, placement = self._rotations[frame.parentJoint], frame.placement
         self.tip_rotation = np.tensordot(placement.rotation.T, rotation, axes=(1, 1)).transpose(1, 0, 2)
-        self.tip_position = np.tensordot(placement.translation, rotation, axes=(0, 1)) + points[0]
-        if with_skeleton:
-            origins = dict(zip([*used, n], [*points[1:], self.tip_position], strict=True))
-            self._segments = np.array([[origins[a], origins[b]] for a, b in self._skeleton.tolist()])
+        along = np.tensordot(placement.translation, rotation, axes=(0, 1))
+        self.tip_position = along + self._origins[frame.parentJoint]
 
     @property
     def torque(self) -> Array:
@@ -147,10 +146,16 @@ class PathWorld:
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
         """
+        pairs = self.segment_pairs()
+        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+
+    def segment_pairs(self) -> PairDistances:
+        """Tell the signed distances of every segment of the robot's skeleton from every obstacle, one by one."""
+        return self._once("segments", self._from_segments)
+
+    def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids
         ends = [(segment, solid) for segment in segments for solid in solids]
-        if not np.all(np.isfinite(segments)):
-            return self._unknown(len(ends))
         corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
         bounds = [gaps(low, high, solid) for low, high in corners for solid in solids]
 
@@ -158,8 +163,10 @@ class PathWorld:
             a, b = ends[pair][0][..., k].tolist()
             return self._scene.segment_apart(a, b, pair % len(solids))
 
-        every = np.array(bounds).reshape(len(bounds), self.q.shape[1])
-        return list(sweep(every, measure, lambda pair, direction: separation(*ends[pair], direction)))
+        def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
+            return separation(ends[pair][0][..., which], ends[pair][1], direction)
+
+        return PairDistances(np.array(bounds).reshape(len(bounds), self.q.shape[1]), measure, separate)
 
     def shape_distances(self) -> list[Array]:
         """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
@@ -170,42 +177,60 @@ class PathWorld:
         Raises:
             RecipeError: The robot has no shape.
         """
+        pairs = self.shape_pairs()
+        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+
+    def shape_pairs(self) -> PairDistances:
+        """Tell the signed distances of every moving piece of the robot's shape from every obstacle, one by one."""
         bodies = self._placed_bodies()
-        return bodies.distances(bodies.from_obstacles)
+        return self._once("shape", lambda: bodies.between(bodies.from_obstacles))
 
     def self_distances(self) -> list[Array]:
         """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
+        pairs = self.self_pairs()
+        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+
+    def self_pairs(self) -> PairDistances:
+        """Tell the signed distances of every two pieces of the robot's shape that must not touch."""
         bodies = self._placed_bodies()
-        return bodies.distances(bodies.among_links)
+        return self._once("self", lambda: bodies.between(bodies.among_links))
+
+    def _once(self, what: str | int, make: Callable[[], PairDistances]) -> PairDistances:
+        """Return what was made since the robot moved, or make it."""
+        if what not in self._pairs:
+            self._pairs[what] = make()
+        return self._pairs[what]
 
     def clear_of_obstacles(self, least: float) -> NDArray[np.bool_]:
         """Say at which states all moving pieces of the robot's shape are so far from all obstacles [m], shape (K,)."""
-        bodies = self._placed_bodies()
-        return bodies.clear(bodies.from_obstacles, least)
+        return self.shape_pairs().clear(least)
 
     def clear_of_itself(self, least: float) -> NDArray[np.bool_]:
         """Say at which states all pieces of the robot's shape that must not touch are so far apart [m], shape (K,)."""
-        bodies = self._placed_bodies()
-        return bodies.clear(bodies.among_links, least)
+        return self.self_pairs().clear(least)
 
-    def arm_points(self) -> Array:
-        """Compute points of the arm of which one moves as far as any point of it, or further [m], shape (P, 3, K).
+    def reach(self, furthest: Array) -> Array:
+        """Bound how far a unit of each joint's speed moves any point of the robot, or of what it holds [m].
 
-        They are the ends of the skeleton's segments, or corners of boxes that hold the links.
+        Args:
+            furthest: Largest absolute joint positions of a motion, shape (n,): they count where joints slide.
+
+        Returns:
+            Shape (n,).
         """
-        if self._bodies is not None:
-            return self._placed_bodies().corners()
-        segments = self.segments()
-        return segments.reshape(-1, *segments.shape[2:])
+        frame, bodies = self._model.frames[self._tip], self._bodies
+        spread = np.array([bodies.spread(joint) if bodies else 0.0 for joint in range(self.robot.n + 1)])
+        held = 0.0 if self._object_size is None else np.linalg.norm(self._object_size) / 2
+        tip = np.linalg.norm(frame.placement.translation) + held
+        spread[frame.parentJoint] = max(spread[frame.parentJoint], tip)
+        return self._trace.reach(spread, furthest)
 
     def _placed_bodies(self) -> Bodies:
         """Return the robot's shape where the robot is."""
         if self._bodies is None:
             raise RecipeError([NO_SHAPE])
         if not self._placed:
-            n = self.robot.n
-            rotations, positions = trace(self._model, self._data, self.q, list(range(n + 1)), n_turned=n + 1)
-            self._bodies.place(rotations, positions, self._solids)
+            self._bodies.place(self._rotations, self._origins, self._solids)
             self._placed = True
         return self._bodies
 
@@ -220,22 +245,39 @@ class PathWorld:
         """
         if self._object_distances is None:
             self._require_object()
-            finite, count = bool(np.all(np.isfinite(self.tip_position))), len(self._solids)
-            self._object_distances = list(map(self._object_distance, range(count))) if finite else self._unknown(count)
+            pairs = self._object_from_each()
+            found = [each.smallest()[0] for each in pairs] if self._is_somewhere() else self._unknown(len(pairs))
+            self._object_distances = found
         return self._object_distances
 
-    def _object_distance(self, index: int) -> Array:
-        """Measure the signed distance of the held object from one obstacle [m], shape (K,)."""
+    def object_pairs(self) -> PairDistances:
+        """Tell the signed distances of the held object from every obstacle."""
+        pairs = self._object_from_each()
+        bounds = np.concatenate([np.empty((0, self.q.shape[1])), *(each.bounds for each in pairs)])
+
+        def measure(pair: int, k: int) -> tuple[float, Array]:
+            return pairs[pair].measure(0, k)
+
+        def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
+            return pairs[pair].separate(0, direction, which)
+
+        return PairDistances(bounds, measure, separate, {i: each.known.get(0, []) for i, each in enumerate(pairs)})
+
+    def _object_from_each(self) -> list[PairDistances]:
+        return [self._once(index, partial(self._from_object, index)) for index in range(len(self._solids))]
+
+    def _from_object(self, index: int) -> PairDistances:
+        """Tell the signed distances of the held object from one obstacle."""
         position, rotation = self.tip_position, self.tip_rotation
         size, solid = self._require_object(), self._solids[index]
 
         def measure(_: int, k: int) -> tuple[float, Array]:
             return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), index)
 
-        def separate(_: int, direction: Array) -> Array:
-            return cuboid_separation(position, rotation, size, solid, direction)
+        def separate(_: int, direction: Array, which: Which = slice(None), /) -> Array:
+            return cuboid_separation(position[:, which], rotation[..., which], size, solid, direction)
 
-        return np.asarray(sweep(cuboid_gaps(position, rotation, size, solid)[None], measure, separate)[0])
+        return PairDistances(cuboid_gaps(position, rotation, size, solid)[None], measure, separate)
 
     def _require_object(self) -> Array:
         """Return the object's edge lengths [m], shape (3,)."""
@@ -259,9 +301,12 @@ class PathWorld:
     def segments(self) -> Array:
         """Compute both ends of every segment of the robot's skeleton [m], shape (segments, 2, 3, K)."""
         if self._segments is None:
-            self._move(with_skeleton=True)
-        assert self._segments is not None
+            points = np.concatenate([self._origins[1:], self.tip_position[None]])
+            self._segments = points[self._skeleton]
         return self._segments
+
+    def _is_somewhere(self) -> bool:
+        return bool(np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all())
 
     def _unknown(self, count: int) -> list[Array]:
         return [np.full(self.q.shape[1], np.nan) for _ in range(count)]

@@ -159,12 +159,12 @@ class World:
             RecipeError: The robot has no shape.
         """
         bodies = self._placed_bodies()
-        return [float(each[0]) for each in bodies.distances(bodies.from_obstacles)]
+        return [float(each[0]) for each in bodies.between(bodies.from_obstacles).smallest()]
 
     def self_distances(self) -> list[float]:
         """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
         bodies = self._placed_bodies()
-        return [float(each[0]) for each in bodies.distances(bodies.among_links)]
+        return [float(each[0]) for each in bodies.between(bodies.among_links).smallest()]
 
     def _placed_bodies(self) -> Bodies:
         """Return the robot's shape where the robot is."""

@@ -5,7 +5,11 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from cnpgen.judges.plans.closer import BOWED, Intervals
+from cnpgen.judges.plans.bow import bows
+from cnpgen.judges.plans.closer import Intervals
+from cnpgen.judges.plans.course import course
+from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.world.path import PathWorld
 from tests.conftest import some
 from tests.examples.plans import bent, load
 
@@ -18,7 +22,7 @@ def test_where_edges_pass_each_other_between_two_moments_the_peak_is_found(
 ) -> None:
     plan = bent(load("dragging"), by, seed=seed)
     found = plan.judged()
-    monkeypatch.setattr(judge_module, "look_closer", lambda _: iter(()))
+    monkeypatch.setattr(judge_module, "look_closer", lambda _, **__: iter(()))
     coarse, fine = plan.judged(), plan.judged(step=2e-5)
     deepest = fine.margins["object contact"].excess
     assert deepest - coarse.margins["object contact"].excess > 1e-4
@@ -45,11 +49,10 @@ def test_a_peak_far_from_the_deepest_moment_is_found_where_it_decides(seed: int,
     assert found.time == pytest.approx(deepest.time, abs=step)
 
 
-def between(room: list[float], ways: list[float]) -> Intervals:
-    """Intervals between moments at which one pair of bodies has so much room; so far they move from one to the next."""
+def between(room: list[float], least: list[float]) -> Intervals:
+    """Intervals between moments at which there is so much room; in each of them so much is certain."""
     moments, values = np.linspace(0, 1, len(room)), np.array(room)
-    ends = [np.column_stack([each[:-1], each[1:]]) for each in (moments, values)]
-    return Intervals(ends[0], ends[1][None], np.array(ways))
+    return Intervals(*(np.column_stack([each[:-1], each[1:]]) for each in (moments, values)), np.array(least))
 
 
 def test_intervals_beside_the_deepest_moment_are_divided() -> None:
@@ -59,28 +62,46 @@ def test_intervals_beside_the_deepest_moment_are_divided() -> None:
 
 
 def test_intervals_that_could_hide_more_than_is_allowed_are_divided() -> None:
-    room = [5.0, 1.0, 3.0, 3.0, 2.0, 2.0, 9.0, 9.0]
-    assert not between(room, [1.0] * 7).hiding().any()
-    assert np.flatnonzero(between(room, [1.0, 1.0, 1.0, 1.0, 4.0, 1.0, 18.0]).hiding()).tolist() == [4, 6]
-    assert not between(room, [1.0, 1.0, 1.0, 1.0, 3.9, 1.0, 17.8]).hiding().any()
-
-
-def test_what_bends_more_than_a_straight_line_is_counted_in() -> None:
-    assert between([1.0, 1.0], [2.0]).hiding().all()
-    assert not between([1.0, 1.0], [2.0 / BOWED - 1e-9]).hiding().any()
+    assert not between([5.0, 1.0, 3.0], [0.0, 1.0]).hiding().any()
+    assert between([5.0, 1.0, 3.0, 2.0], [-1e-9, 1.0, -np.inf]).hiding().tolist() == [True, False, True]
 
 
 def test_where_more_than_is_allowed_is_exceeded_anyway_nothing_is_searched() -> None:
-    assert not between([5.0, -0.1, 3.0], [50.0] * 2).hiding().any()
-    assert not between([5.0, np.nan, 3.0], [50.0] * 2).hiding().any()
+    assert not between([5.0, -0.1, 3.0], [-50.0] * 2).hiding().any()
+    assert not between([5.0, np.nan, 3.0], [-50.0] * 2).hiding().any()
 
 
 def test_of_more_intervals_than_can_be_looked_into_those_that_hide_most_are_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("cnpgen.judges.plans.closer.MOST", 2)
-    found = between([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [9.0, 9.0, 20.0, 9.1, 30.0]).hiding()
+    found = between([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [-1.0, -1.0, -3.0, -1.0, -2.0]).hiding()
     assert np.flatnonzero(found).tolist() == [2, 4]
+
+
+@pytest.mark.parametrize(("label", "kind"), [("transport", "object"), ("dragging", "object"), ("transport", "segment")])
+def test_what_is_certain_between_two_moments_holds_at_moments_between(label: str, kind: str) -> None:
+    """By as much as the nearest body is certain to be away all the way, it is away at every moment of a finer grid."""
+    plan = bent(load(label), 0.01, seed=1)
+    world = PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
+    (tops,) = obstacle_tops(plan.problem, plan.start_xyz, plan.goal_xyz)
+    s, finer = np.linspace(0, 1, 161), np.linspace(0, 1, 160 * 8 + 1)
+    found = {}
+    for phases in (s, finer):
+        states = course(plan.motion, phases)
+        world.set_path(states.q, states.dq, states.ddq, tops)
+        found[len(phases)] = getattr(world, f"{kind}_pairs")()
+        if phases is s:
+            reach = world.reach(np.zeros(plan.robot.n))
+            ways, leave = reach @ np.abs(np.diff(states.q, axis=1)), bows(plan.motion, s, reach)
+    pairs, every = found[len(s)], found[len(finer)]
+    for least in (-0.002, 0.0, 0.02):
+        certain = pairs.between(np.full(len(pairs.bounds), least), ways, leave)
+        room = np.array([[every.measure(pair, k)[0] for k in range(len(finer))] for pair in range(len(every.bounds))])
+        nearest = np.array([room[:, 8 * k : 8 * k + 9].min() for k in range(160)]) - least
+        assert (certain <= nearest + 1e-9).all()
+        clearly = nearest > 2e-3
+        assert (certain[clearly] >= 0).all(), "what is clearly away is found to be"
 
 
 def test_a_peak_at_either_end_is_no_trouble() -> None:

@@ -1,5 +1,7 @@
 """Forward kinematics of many states: what Pinocchio says of each."""
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -7,33 +9,56 @@ import pytest
 from cnpgen.errors import MachineError
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
-from cnpgen.world import trace as module
-from cnpgen.world.trace import trace
+from cnpgen.world.trace import Trace
+from tests.examples.shaped_robot import write_problem
+
+BRANCHING = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
+<joint name="turn" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/>
+<axis xyz="1 2 3"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+<joint name="slide" type="prismatic"><parent link="b"/><child link="c"/><origin xyz="0 0.2 0" rpy="1 0 0"/>
+<axis xyz="3 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="other" type="revolute"><parent link="b"/><child link="d"/><origin xyz="0 0 0.4"/>
+<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint></robot>"""
 
 
-@pytest.mark.parametrize("name", ["airhockey", "heavy-object"])
-def test_poses_are_those_of_every_single_state(name: str) -> None:
-    robot = load_robot(load_problem(name))
-    model, data, other = robot.model, robot.model.createData(), robot.model.createData()
-    q = np.random.default_rng(0).uniform(-2, 2, (robot.n, 40))
-    joints = [robot.n, 1, 4]
-    rotations, positions = trace(model, data, q, joints, n_turned=2)
-    for k, state in enumerate(q.T):
-        pin.forwardKinematics(model, other, state.copy())
-        for joint, rotation in zip(joints, rotations, strict=False):
-            np.testing.assert_array_equal(rotation[..., k], other.oMi[joint].rotation)
-        for joint, position in zip(joints, positions, strict=True):
-            np.testing.assert_array_equal(position[:, k], other.oMi[joint].translation)
+def models(folder: Path) -> dict[str, pin.Model]:
+    """Robots whose joints turn, slide and branch."""
+    problems = [load_problem("airhockey"), load_problem("heavy-object"), load_problem(write_problem(folder))]
+    found = {problem.name: load_robot(problem).model for problem in problems}
+    return {**found, "branching": pin.buildModelFromXML(BRANCHING)}
 
 
-def test_arrays_that_are_copies_are_noticed() -> None:
-    robot = load_robot(load_problem("airhockey"))
-    import eigenpy
+def test_poses_are_those_of_every_single_state(tmp_path: Path) -> None:
+    for name, model in models(tmp_path).items():
+        data, q = model.createData(), np.random.default_rng(0).uniform(-2, 2, (model.nq, 40))
+        rotations, positions = Trace(model).poses(q)
+        for k, state in enumerate(q.T):
+            pin.forwardKinematics(model, data, state.copy())
+            for joint, pose in enumerate(data.oMi):
+                np.testing.assert_allclose(rotations[joint, ..., k], pose.rotation, atol=1e-14, err_msg=name)
+                np.testing.assert_allclose(positions[joint, :, k], pose.translation, atol=1e-14, err_msg=name)
 
-    before = eigenpy.sharedMemory()
-    eigenpy.sharedMemory(False)
-    try:
-        with pytest.raises(MachineError, match="sharedMemory"):
-            module.trace(robot.model, robot.model.createData(), np.ones((robot.n, 3)), [robot.n])
-    finally:
-        eigenpy.sharedMemory(before)
+
+def test_poses_that_are_not_pinocchios_are_refused() -> None:
+    model = load_robot(load_problem("airhockey")).model
+    trace = Trace(model)
+    model.jointPlacements[3].translation += 1e-6  # the model is another one than its numbers were taken from
+    with pytest.raises(MachineError, match=r"differ from Pinocchio's by 1\.4e-06"):
+        trace.poses(np.ones((model.nq, 3)))
+
+
+def test_no_point_moves_further_than_the_reach_says(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    for model in models(tmp_path).values():
+        data, spread = model.createData(), np.full(model.njoints, 0.2)
+        reach = Trace(model).reach(spread, np.full(model.nq, 2.0))
+        points = random.normal(size=(50, 3))
+        points *= 0.2 / np.linalg.norm(points, axis=1)[:, None]
+        for _ in range(50):
+            q, dq = random.uniform(-2, 2, model.nq), random.normal(size=model.nq)
+            places = []
+            for state in (q, q + 1e-6 * dq):
+                pin.forwardKinematics(model, data, state)
+                places.append([pose.act(point) for pose in list(data.oMi)[1:] for point in points])
+            moved = np.linalg.norm(np.diff(places, axis=0)[0], axis=1).max()
+            assert moved <= 1e-6 * (reach @ np.abs(dq)) * (1 + 1e-5)

@@ -15,7 +15,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import solids_of
-from cnpgen.world.trace import trace
+from cnpgen.world.trace import Trace
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def _scene(
 def _poses(robot: Robot, q: Array) -> Array:
     """Return the poses of all joints and of the tip at K states, shape (K, n + 2, 4, 4)."""
     n = robot.n
-    rotations, positions = trace(robot.model, robot.model.createData(), q, list(range(n + 1)), n_turned=n + 1)
+    rotations, positions = Trace(robot.model).poses(q)
     poses = np.zeros((q.shape[1], n + 2, 4, 4))
     for joint, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
         poses[:, joint, :3, :3], poses[:, joint, :3, 3] = rotation.transpose(2, 0, 1), position.T

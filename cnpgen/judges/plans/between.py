@@ -48,12 +48,12 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> Pieces:
     """Return the polynomials of one motion, those of its jerks if they are wanted."""
     degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
     edges = _edges(len(path), len(rate), degree)
-    p, p1, p2 = (_in_bernstein_form(path, degree, order, edges) for order in range(3))
-    r, r1 = (_in_bernstein_form(rate, degree, order, edges) for order in range(2))
+    p, p1, p2 = (in_bernstein_form(path, degree, order, edges) for order in range(3))
+    r, r1 = (in_bernstein_form(rate, degree, order, edges) for order in range(2))
     ddq = _product(_product(p2, r) + _product(p1, r1), r)
     if not jerk:
         return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq)
-    p3, r2 = _in_bernstein_form(path, degree, 3, edges), _in_bernstein_form(rate, degree, 2, edges)
+    p3, r2 = in_bernstein_form(path, degree, 3, edges), in_bernstein_form(rate, degree, 2, edges)
     bends = _product(_product(p3, r) + 3 * _product(p2, r1), r)
     third = _product(bends + _product(p1, _product(r2, r) + _product(r1, r1)), r)
     return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq, jerk=third)
@@ -102,7 +102,7 @@ def _edges(path_points: int, rate_points: int, degree: int) -> Array:
     return np.array([knots[key] for key in sorted(knots)])
 
 
-def _in_bernstein_form(control: Array, degree: int, order: int, edges: Array) -> Array:
+def in_bernstein_form(control: Array, degree: int, order: int, edges: Array) -> Array:
     """Return a derivative of splines between edges, shape (n, S, D - order + 1); ``control`` has shape (C, n)."""
     matrix = _to_bernstein_form(len(control), degree, order, tuple(edges.tolist()))
     pieces = (matrix @ control).reshape(len(edges) - 1, degree - order + 1, -1)

@@ -19,7 +19,7 @@ from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
 from cnpgen.judges.plans.peaks import look_at_peaks
-from cnpgen.judges.plans.sampling import Samples, sample, time_table
+from cnpgen.judges.plans.sampling import CELLS, FEW_CELLS, Samples, sample, time_table
 from cnpgen.judges.plans.survey import Survey, survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.obstacles import obstacle_tops
@@ -91,7 +91,8 @@ class Judge:
     ) -> list[Verdict]:
         """Judge N plans; arguments as of ``judge``.
 
-        A brief verdict has neither metrics nor the paper's rule, and of joint limits that hold the margins at samples.
+        A brief verdict has neither metrics nor the paper's rule. It is from fewer samples, on which it does not depend
+        whether a plan is valid; how much room conditions have is less exact.
         """
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
         with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
@@ -168,7 +169,7 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
 
 def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
-    found = _samples(plan, step)
+    found = _samples(plan, step, sparse=brief)
     if isinstance(found, Verdict):
         return found
     samples, table = found
@@ -194,7 +195,7 @@ def _margins(survey: Survey, *, brief: bool) -> list[Margin]:
         if is_proven(each)
     }
     worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
-    for each, margin in chain(look_closer(survey), look_at_peaks(survey)):
+    for each, margin in chain(look_closer(survey, brief=brief), look_at_peaks(survey)):
         worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
     for constraint in survey.problem.constraint:
         margins += [proven[id(constraint)]] if id(constraint) in proven else []
@@ -218,18 +219,18 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
 
 
-def _samples(plan: _Plan, step: float) -> tuple[Samples, Array] | Verdict:
-    """Choose where to look, and tell the times of ``table_phases()`` [s], or say why there is nothing to look at."""
+def _samples(plan: _Plan, step: float, *, sparse: bool) -> tuple[Samples, Array] | Verdict:
+    """Choose where to look, and tabulate the times, or say why there is nothing to look at."""
     if not plan.is_finite():
         return Verdict(Reason.NOT_FINITE)
     if not plan.motion.runs_forward()[0]:
         return Verdict(Reason.RATE)
     rate, degree = plan.motion.rate[0], plan.motion.degree
-    table = time_table(rate, degree)
+    table = time_table(rate, degree, cells=FEW_CELLS if sparse else CELLS)
     spans = max(plan.motion.path.shape[1], len(rate)) - degree
     kinks = {s for constraint in plan.problem.constraint for s in constraint.kinks}
-    samples = sample(table, step, spans, kinks)
-    return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[-1])))
+    samples = sample(table, step, spans, kinks, sparse=sparse)
+    return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
 
 
 def reason_of(margins: list[Margin]) -> str:

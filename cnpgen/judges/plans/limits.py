@@ -36,18 +36,20 @@ def limit_margin(
         world: The robot at the samples.
         pieces: The motion as polynomials.
         s: Phases of the samples, shape (K,).
-        table: Times of the motion at ``table_phases()`` [s].
-        brief: Whether, where the limit is proven to hold, it is enough to know how close samples come to it.
+        table: Its times, as ``time_table`` returns them.
+        brief: Whether, where the limit is proven to hold, it is enough to know how close knots come to it.
     """
     (condition,) = constraint.measured(cast("World", world))
     allowed = constraint.allowed(condition)
     scale = np.maximum(allowed, LEAST * np.maximum(np.abs(condition.lower), np.abs(condition.upper)))
     coefficients: Array = getattr(pieces, _COEFFICIENTS[type(constraint)])
-    sampled = _beyond(np.array(condition.g)[:, None], condition, scale)[:, 0]
-    row, k = divmod(int(np.argmax(sampled)), len(s))
-    known = float(sampled[row, k]), row, float(s[k])
-    least = 1.0 if brief else -np.inf
-    share, row, phase = largest(_beyond(coefficients, condition, scale), pieces.edges, known, least=least)
+    shares = _beyond(coefficients, condition, scale)
+    sampled, at = shares[..., 0], pieces.edges
+    if not brief:
+        sampled, at = _beyond(np.array(condition.g)[:, None], condition, scale)[:, 0], s
+    row, k = divmod(int(np.argmax(sampled)), sampled.shape[1])
+    known = float(sampled[row, k]), row, float(at[k])
+    share, row, phase = largest(shares, pieces.edges, known, least=1.0 if brief else -np.inf)
     low, part = row < len(scale), row % len(scale)
     excess, bound = share * scale[part], (condition.lower if low else condition.upper)[part]
     return Margin(

@@ -15,7 +15,7 @@ from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.store.files.picture import new_figure, save_figure
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
-from cnpgen.world.trace import trace
+from cnpgen.world.trace import Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -195,10 +195,7 @@ def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, floa
     robot = world.robot
     if robot.shape is None:
         return [(segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]]
-    joints = list(range(robot.n + 1))
-    rotations, positions = trace(
-        robot.model, robot.model.createData(), world.q[:, k : k + 1], joints, n_turned=robot.n + 1
-    )
+    rotations, positions = Trace(robot.model).poses(world.q[:, k : k + 1])
     places = ((piece, robot.shape.joints[piece.link]) for piece in robot.shape.pieces)
     return [
         (piece.vertices @ rotations[joint, :, :, 0].T + positions[joint, :, 0], piece.radius) for piece, joint in places

@@ -14,10 +14,11 @@ Array = NDArray[np.float64]
 FEWEST = 200  # samples of a motion
 LONGEST = 200_000  # time steps that a motion may take: three minutes at 1 ms, which take a second to look at
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
-CELLS = 4096  # of equal size in the table of times
+CELLS, FEW_CELLS = 4096, 512  # of equal size in the table of times, and in that of a first look
 PER_SPAN = 8  # samples between two knots, evenly in phase
 AT_ENDS = 64  # additional samples at each end
 END = 0.05  # how far from each end they reach, in phase
+SPARSE = 4  # times fewer samples are enough for a first look
 
 
 @dataclass(frozen=True)
@@ -37,29 +38,33 @@ class Samples:
         return float(np.diff(self.t) @ (values[1:] + values[:-1])) / 2
 
 
-def time_table(rate: Array, degree: int) -> Array:
-    """Times at the table's phases [s], by a two-point Gauss rule between each two of them.
+def time_table(rate: Array, degree: int, *, cells: int = CELLS) -> Array:
+    """Tabulate phases and the times at them [s], by a two-point Gauss rule between each two of them.
 
     Args:
         rate: Control points of r [1/s], shape (R,), of a positive r.
         degree: Its degree.
+        cells: Number of cells of equal size.
 
     Returns:
-        Shape (len(table_phases()),), ascending from 0 to the duration.
+        Shape (2, C), both rows ascending: phases from 0 to 1, times from 0 to the duration.
     """
-    inverse = 1.0 / (_nodes(len(rate), degree) @ rate)
-    cells = (inverse[::2] + inverse[1::2]) * np.diff(table_phases()) / 2
-    return np.concatenate([[0.0], np.cumsum(cells)])
+    phases = _table_phases(cells)
+    inverse = 1.0 / (_nodes(len(rate), degree, cells) @ rate)
+    times = np.cumsum((inverse[::2] + inverse[1::2]) * np.diff(phases) / 2)
+    return np.stack([phases, np.concatenate([[0.0], times])])
 
 
 @cache
-def table_phases() -> Array:
+def _table_phases(cells: int) -> Array:
     """Phases between which 1 / r is smooth: even ones, and geometric ones near the ends, where r may be almost 0."""
-    near = np.geomspace(1e-9, 12 / CELLS, 160)
-    return np.unique(np.concatenate([np.linspace(0, 1, CELLS + 1), near, 1 - near]))
+    near = np.geomspace(1e-9, 12 / cells, 160)
+    return np.unique(np.concatenate([np.linspace(0, 1, cells + 1), near, 1 - near]))
 
 
-def sample(table: Array, step: float, spans: int, also: Collection[float] = ()) -> Samples | None:
+def sample(
+    table: Array, step: float, spans: int, also: Collection[float] = (), *, sparse: bool = False
+) -> Samples | None:
     """Choose samples that are at most ``step`` apart and see everything that a B-spline can do.
 
     * Times, at least ``FEWEST``, no more than ``step`` apart.
@@ -72,30 +77,32 @@ def sample(table: Array, step: float, spans: int, also: Collection[float] = ()) 
         step: Time step [s].
         spans: Number of intervals between the knots of the finer spline.
         also: Further phases.
+        sparse: Whether ``SPARSE`` times fewer are enough, half of them in every span.
 
     Returns:
         The samples, or None if the motion takes longer than ``LONGEST`` steps.
     """
-    duration = table[-1]
+    duration = table[1, -1]
     if not duration < step * LONGEST:
         return None
-    count = max(FEWEST, int(np.ceil(SPARE * duration / step)) + 1)
-    phases = table_phases()
-    by_time = np.interp(np.linspace(0, duration, count), table, phases)
-    near = END * (np.arange(AT_ENDS + 1) / AT_ENDS) ** 2
-    s = np.unique(np.concatenate([by_time, np.linspace(0, 1, PER_SPAN * spans + 1), near, 1 - near, list(also)]))
+    fewer = SPARSE if sparse else 1
+    count = max(FEWEST // fewer, int(np.ceil(SPARE * duration / (fewer * step))) + 1)
+    by_time = np.interp(np.linspace(0, duration, count), table[1], table[0])
+    near = END * np.linspace(0, 1, AT_ENDS // fewer + 1) ** 2
+    evenly = np.linspace(0, 1, (PER_SPAN // 2 if sparse else PER_SPAN) * spans + 1)
+    s = np.unique(np.concatenate([by_time, evenly, near, 1 - near, list(also)]))
     return Samples(s, times(s, table))
 
 
 def times(s: Array, table: Array) -> Array:
     """Return when a motion is at phases s [s], shape (K,); ``table`` is what ``time_table`` returned."""
-    return np.interp(s, table_phases(), table)
+    return np.interp(s, *table)
 
 
 @cache
-def _nodes(points: int, degree: int) -> Array:
+def _nodes(points: int, degree: int, cells: int) -> Array:
     """Basis of r at the Gauss nodes of the table's cells, shape (2 cells, R)."""
-    phases = table_phases()
+    phases = _table_phases(cells)
     middle, half = (phases[1:] + phases[:-1]) / 2, np.diff(phases) / 2
     offset = half / np.sqrt(3)
     return basis(np.stack([middle - offset, middle + offset], axis=1).ravel(), points, degree)

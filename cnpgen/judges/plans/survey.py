@@ -28,7 +28,7 @@ class Survey:
         motion: One motion.
         tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         samples: When and at which phases it was looked at first.
-        table: Its times at ``table_phases()`` [s].
+        table: Its times, as ``time_table`` returns them.
         start_tip: Where the tip is at the start [m], shape (3,).
         world: The robot; ``move`` moves it.
         measured: Conditions at the samples.
@@ -68,7 +68,7 @@ def survey(  # noqa: PLR0917 - each of them is half of what is surveyed
         tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
         world: The robot at the samples.
         samples: When and at which phases that is.
-        table: Times of the motion at ``table_phases()`` [s].
+        table: Its times, as ``time_table`` returns them.
     """
     start_tip = world.tip_position[:, 0].copy()
     others = [constraint for constraint in problem.constraint if not is_proven(constraint)]
