@@ -9,15 +9,19 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from cnpgen.errors import MachineError
 
 LIBRARIES, TAPES = "lib", "tape"
 _WARM = "warm"  # in a temporary folder: a link to the cache that can be read but not written
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
+PATIENCE = 600  # [s] a process that needs longer may have been stopped: it is no longer waited for
 
 
 def default_cache_folder() -> Path:
@@ -82,6 +86,38 @@ def make_private(folder: Path) -> None:
 def keep_from_others(path: Path) -> None:
     """Let nobody else write to a file, whatever the umask is; who may read it stays as it is."""
     path.chmod(path.stat().st_mode & ~_OTHERS)
+
+
+@contextmanager
+def one_at_a_time(lock: Path) -> Iterator[None]:
+    """Let one process after the other do what is inside, where the system has locks; they end with their process.
+
+    Raises:
+        OSError: The lock's file cannot be made.
+    """
+    with os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR), "r+b") as file:
+        with suppress(FileNotFoundError):  # another process is done and has removed it
+            lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # whatever the umask is
+        end = time.monotonic() + PATIENCE
+        while _is_held(file) and time.monotonic() < end:
+            time.sleep(0.02)
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+
+
+def _is_held(file: IO[bytes]) -> bool:
+    """Take the lock on a file; whether another process holds it."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except (ImportError, OSError):  # Windows, and file systems without locks
+        return False
+    return False
 
 
 def warm_folder(folder: Path) -> Path | None:

@@ -19,7 +19,15 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.cache import LIBRARIES, is_trusted, keep_from_others, make_private, require_trusted, warm_folder
+from cnpgen.kernels.cache import (
+    LIBRARIES,
+    is_trusted,
+    keep_from_others,
+    make_private,
+    one_at_a_time,
+    require_trusted,
+    warm_folder,
+)
 from cnpgen.kernels.emit import VECTORS, emit, prelude
 from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
@@ -274,20 +282,26 @@ def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
 
 
 def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
-    """Compile C source into the cache."""
+    """Compile C source into the cache, unless another process has done so while this one waited for it."""
     libraries = cache_folder / LIBRARIES
     try:
-        _announce(cache_folder)
         make_private(libraries)
         require_trusted(cache_folder)
-        with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
-            written, built = Path(folder) / f"{stem.rpartition('-')[0]}.c", Path(folder) / "kernel.so"
-            written.write_text(source(), encoding="utf-8")
-            _run_compiler(require_compiler(), level, written, built)
-            keep_from_others(built)
-            return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
+        with one_at_a_time(libraries / f".{stem}.lock"):
+            return find_library(libraries, stem) or _build(stem, source, level, cache_folder)
     except OSError as error:
         raise _unusable(cache_folder, error) from error
+
+
+def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
+    libraries = cache_folder / LIBRARIES
+    _announce(cache_folder)
+    with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
+        written, built = Path(folder) / f"{stem.rpartition('-')[0]}.c", Path(folder) / "kernel.so"
+        written.write_text(source(), encoding="utf-8")
+        _run_compiler(require_compiler(), level, written, built)
+        keep_from_others(built)
+        return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
 
 
 def _unusable(cache_folder: Path, error: OSError) -> MachineError:

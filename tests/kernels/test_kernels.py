@@ -19,6 +19,7 @@ import pytest
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels import compiled as compiled_module
 from cnpgen.kernels import library as library_module
+from cnpgen.kernels.cache import make_private, one_at_a_time
 from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler, vector_flags
 from cnpgen.kernels.emit import emit
 from cnpgen.kernels.interpreted import BLOCK, InterpretedKernel
@@ -539,15 +540,41 @@ def test_a_library_without_a_kernel_is_a_machine_error(root, tmp_path):
         CompiledKernel(tape_from_function(root, ROOT), library)
 
 
+@pytest.fixture
+def compilers(monkeypatch) -> list[Path]:
+    """What the compiler is run for."""
+    sources: list[Path] = []
+    real = compiled_module._run_compiler
+
+    def run(compiler: str, level: str, source: Path, built: Path) -> None:
+        sources.append(source)
+        real(compiler, level, source, built)
+
+    monkeypatch.setattr(compiled_module, "_run_compiler", run)
+    return sources
+
+
 @needs_compiler
-def test_a_library_is_compiled_once_and_by_any_number_of_processes_at_once(root, tmp_path, monkeypatch):
+def test_a_library_is_compiled_once_however_many_processes_want_it_at_once(root, tmp_path, compilers):
     tape = tape_from_function(root, ROOT)
     with ThreadPoolExecutor(3) as pool:
         paths = set(pool.map(lambda _: compile_tape(tape, tmp_path), range(3)))
-    assert len(paths) == 1
+    assert len(paths) == len(compilers) == 1
     assert [path.name for path in (tmp_path / "lib").iterdir()] == [path.name for path in paths]
-    monkeypatch.setattr(compiled_module, "_run_compiler", lambda *_: pytest.fail("compiled again"))
     assert compile_tape(tape, tmp_path) in paths
+    assert len(compilers) == 1
+
+
+@needs_compiler
+def test_a_process_that_was_stopped_while_it_compiled_is_not_waited_for_for_ever(root, tmp_path, monkeypatch):
+    tape = tape_from_function(root, ROOT)
+    lock = tmp_path / "lib" / f".{compiled_module.library_stem(tape, find_compiler())}.lock"
+    make_private(lock.parent)
+    monkeypatch.setattr("cnpgen.kernels.cache.PATIENCE", 0.1)
+    with one_at_a_time(lock):
+        began = time.monotonic()
+        assert compile_tape(tape, tmp_path).exists()
+        assert time.monotonic() - began >= 0.1
 
 
 def repository() -> Path:
