@@ -135,17 +135,25 @@ def _listing(*, as_json: bool) -> str:
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
     from cnpgen.cli.describe import table
-    from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.schema import registry
 
-    planners = {
-        name: kind_summary(registry.load(registry.PLANNERS, name)) for name in registry.names(registry.PLANNERS)
-    }
     found = {
         "suites": {name: load_suite(name).title for name in list_suites()},
-        "planners": planners,
+        "planners": {name: _summary(name) for name in registry.names(registry.PLANNERS)},
         "plants": {plant.name: plant.title for plant in PLANTS.values()},
     }
     if as_json:
         return json.dumps(found, indent=2)
     return "\n\n".join("\n".join([what, *table(list(names.items()), indent="  ")]) for what, names in found.items())
+
+
+def _summary(planner: str) -> str:
+    """Say in a line what a planner does, or why it cannot be used: it may be anybody's."""
+    from cnpgen.cli.describe_keys import kind_summary
+    from cnpgen.errors import CnpgenError
+    from cnpgen.schema import registry
+
+    try:
+        return kind_summary(registry.load(registry.PLANNERS, planner))
+    except CnpgenError as error:
+        return f"cannot be used: {error}"
