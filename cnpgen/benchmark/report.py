@@ -167,6 +167,7 @@ def _shown(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
                 save_film(film, scene, execution, reference.ticks, most=FRAMES)
             except MachineError as error:
                 text += f"; no film: {escape(str(error))}"
+                film.unlink(missing_ok=True)
         if not film.exists():
             return f"<img src='{still}'>", text
         source = _embedded(film, "video/mp4")
