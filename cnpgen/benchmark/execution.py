@@ -1,8 +1,11 @@
 """What planners return, executed: plans and sampled trajectories alike, in the scene of their boundary problem."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.results import answer_from_dict
 from cnpgen.benchmark.simulator.execute import Execution
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.plant import Plant
@@ -15,8 +18,8 @@ from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 
 Array = NDArray[np.float64]
-Task = tuple[Plans, Plans | Trajectory, Lead | None]
-"""One boundary problem, one plan or a trajectory for it, and of a turn the first motion."""
+Task = tuple[Plans, dict[str, Any], Lead | None]
+"""One boundary problem, the answer as results keep it, and of a turn the first motion."""
 
 
 def execute_answer(task: Task, *, plant: Plant) -> Executed:
@@ -27,31 +30,28 @@ def execute_answer(task: Task, *, plant: Plant) -> Executed:
         plant: The robot.
     """
     try:
-        return execution_of(*task, plant)[2].executed
+        return execution_of(task, plant)[2].executed
     except UsageError as error:
         return Executed(failure=str(error))
 
 
-def execution_of(
-    problem: Plans, answer: Plans | Trajectory, lead: Lead | None, plant: Plant
-) -> tuple[Scene, Reference, Execution]:
+def execution_of(task: Task, plant: Plant) -> tuple[Scene, Reference, Execution]:
     """Execute what a planner returned.
 
     Args:
-        problem: One boundary problem.
-        answer: One plan or a trajectory.
-        lead: Of a turn the first motion, which is executed up to the turn; else None.
+        task: The problem and the answer; of a turn, the first motion is executed up to the turn.
         plant: The robot.
 
     Returns:
         The world, what the controller followed, and what happened.
 
     Raises:
-        UsageError: It cannot be executed.
+        UsageError: It cannot be executed, or is no answer.
         RecipeError: MuJoCo cannot simulate the robot.
         MachineError: MuJoCo is missing.
     """
-    states, duration = _timed(answer)
+    problem, content, lead = task
+    states, duration = _timed(answer_from_dict(problem, content))
     if lead is None:
         return execute_states(problem, states, duration, plant, problem.boundary.start_dq[0])
     return execute_states(problem, joined(lead, states), float(lead.until[0]) + duration, plant)

@@ -11,9 +11,10 @@ from enum import StrEnum
 from multiprocessing.connection import Connection
 from typing import Any
 
-from cnpgen.benchmark.planner import Answer, Setting
+from cnpgen.benchmark.planner import Plan, Setting
+from cnpgen.benchmark.results import answer_from_dict, answer_to_dict
 from cnpgen.benchmark.trajectory import Trajectory
-from cnpgen.errors import CnpgenError, UsageError
+from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
 from cnpgen.schema import registry
@@ -21,6 +22,7 @@ from cnpgen.schema import registry
 GRACE = 2.0  # times the limit, and
 SPARE = 10.0  # s: a planner that has not answered after this is stopped
 STARTING = 300.0  # s: to load what is loaded once, kernels compiled
+STDERR = 2  # the file descriptor
 
 
 class Ending(StrEnum):
@@ -39,14 +41,14 @@ class Attempt:
 
     Attributes:
         ending: How it ended.
-        answer: The plan or the trajectory, if there is one.
+        answer: The plan or the trajectory as results keep it, if there is one: nothing of the planner's own is in it.
         seconds: Wall time of planning [s].
         cpu_seconds: CPU time of planning [s].
         error: What the planner said, or empty.
     """
 
     ending: Ending
-    answer: Answer = None
+    answer: dict[str, Any] | None = None
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     error: str = ""
@@ -64,19 +66,25 @@ class PlannerProcess:
         self._name, self._setting = name, setting
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
+        self._unprepared: Attempt | None = None
 
     def plan(self, problem: Plans) -> Attempt:
         """Let it plan for one problem.
 
         Raises:
-            UsageError: It cannot plan for problems of this kind.
+            UsageError: It says that it cannot plan for problems of this kind.
+            MachineError: It says what this machine lacks.
         """
-        pipe = self._started()
+        if self._unprepared is None and self._pipe is None:
+            self._unprepared = self._start()
+        if self._unprepared is not None:
+            return self._unprepared
         began = time.perf_counter()
         try:
-            pipe.send(problem)
-            if pipe.poll(GRACE * self._setting.time_limit + SPARE):
-                found: Attempt = pipe.recv()
+            assert self._pipe is not None
+            self._pipe.send(problem)
+            if self._pipe.poll(GRACE * self._setting.time_limit + SPARE):
+                found: Attempt = self._pipe.recv()
                 return found
         except (EOFError, OSError):
             self.stop()
@@ -93,23 +101,27 @@ class PlannerProcess:
             self._pipe.close()
         self._process = self._pipe = None
 
-    def _started(self) -> Connection:
-        if self._pipe is not None:
-            return self._pipe
+    def _start(self) -> Attempt | None:
+        """Start the process; return what becomes of all problems if the planner does not get ready."""
+        began = time.perf_counter()
         self._pipe, theirs = multiprocessing.Pipe()
         with theirs:  # no multiprocessing.Process: workers of dask may not start one, and it runs the caller's script
             program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({theirs.fileno()})"
             command = [sys.executable, "-c", program]
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
-        said: str | None = "it did not begin"
+            self._process = subprocess.Popen(  # what planners print is no data
+                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR
+            )
+        refusal, said = None, "its process ended, or it did not get ready"
         with suppress(EOFError, OSError):
             self._pipe.send((self._name, self._setting))
             if self._pipe.poll(STARTING):
-                said = self._pipe.recv()
-        if said is not None:
-            self.stop()
-            raise UsageError(f"planner {self._name!r} cannot plan here: {said}")
-        return self._pipe
+                refusal, said = self._pipe.recv()
+        if not said:
+            return None
+        self.stop()
+        if refusal is not None:
+            raise refusal(f"planner {self._name!r} cannot plan here: {said}")
+        return Attempt(Ending.CRASHED, seconds=time.perf_counter() - began, error=f"before the first problem: {said}")
 
 
 def serve(descriptor: int) -> None:
@@ -124,43 +136,46 @@ def serve(descriptor: int) -> None:
         try:
             plan = registry.load(registry.PLANNERS, name)().prepare(setting)
         except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
-            pipe.send(_said(error))
+            pipe.send((_refusal(error), _said(error)))
             return
-        pipe.send(None)
+        pipe.send((None, ""))
         while True:
             pipe.send(_attempt(plan, pipe.recv()))
 
 
-def _attempt(plan: Any, problem: Plans) -> Attempt:
+def _attempt(plan: Plan, problem: Plans) -> Attempt:
     """Plan for one problem and take the time."""
     began, cpu = time.perf_counter(), time.process_time()
-    answer, ending, error = None, Ending.FAILED, ""
     try:
-        with one_thread():
-            answer = plan(problem)
-        ending, error = _ending_of(answer, problem)
-    except Exception as found:  # noqa: BLE001 - likewise
-        error = _said(found)
-    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
-    return Attempt(ending, answer if ending == Ending.PLANNED else None, seconds, cpu, error)
+        try:
+            with one_thread():
+                answer = plan(problem)
+        finally:
+            seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+        content = _content(answer, problem)
+    except Exception as error:  # noqa: BLE001 - likewise
+        return Attempt(Ending.FAILED, None, seconds, cpu, _said(error))
+    return Attempt(Ending.NO_PLAN if content is None else Ending.PLANNED, content, seconds, cpu)
 
 
-def _ending_of(answer: Any, problem: Plans) -> tuple[Ending, str]:
-    """Say whether an answer is one, with the joints of the problem."""
+def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
+    """Return an answer as results keep it, if it is one that can be read back."""
     if answer is None:
-        return Ending.NO_PLAN, ""
-    if isinstance(answer, Plans) and len(answer) == 1:
-        joints = answer.path_control_points.shape[2]
-    elif isinstance(answer, Trajectory):
-        joints = answer.q.shape[1]
-    else:
-        return Ending.FAILED, f"expected one plan, a Trajectory or None, got {answer!r:.60}"
-    wanted = problem.boundary.start_q.shape[1]
-    if joints != wanted:
-        return Ending.FAILED, f"the problem has {wanted} joints, its answer {joints}"
-    return Ending.PLANNED, ""
+        return None
+    if not isinstance(answer, Plans | Trajectory) or (isinstance(answer, Plans) and len(answer) != 1):
+        raise UsageError(f"expected one plan, a Trajectory or None, got {answer!r:.60}")
+    content = answer_to_dict(answer)
+    answer_from_dict(problem, content)
+    return content
+
+
+def _refusal(error: Exception) -> type[CnpgenError] | None:
+    """Return what the user gets who asked for a planner that says that it cannot plan; None if it just failed."""
+    if not isinstance(error, CnpgenError):
+        return None
+    return MachineError if isinstance(error, MachineError) else UsageError
 
 
 def _said(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, CnpgenError) else f"{type(error).__name__}: {text}"
+    return text if text and isinstance(error, CnpgenError) else f"{type(error).__name__}: {text}"

@@ -1,18 +1,18 @@
-"""A report of a benchmark as one HTML file: tables beside the paper's figures, box plots, a picture."""
+"""A report of a benchmark as one HTML file: tables beside the paper's figures, box plots, pictures or films."""
 
 import base64
 import io
+import tempfile
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from cnpgen.benchmark.execution import execution_of
-from cnpgen.benchmark.results import answer_from_dict
+from cnpgen.benchmark.execution import Task, execution_of
 from cnpgen.benchmark.run import Benchmark
-from cnpgen.benchmark.simulator.picture import save_picture
+from cnpgen.benchmark.simulator.picture import save_film, save_picture
 from cnpgen.benchmark.simulator.plant import Plant
-from cnpgen.benchmark.statistics import FIGURES, FLAGS, values_of
-from cnpgen.errors import MachineError
+from cnpgen.benchmark.statistics import FIGURES, FLAGS, compared_with, values_of
+from cnpgen.errors import CnpgenError, MachineError
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.picture import new_figure
 
@@ -28,16 +28,20 @@ PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure 
     },
     "hits-110": {"cnp-b": {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
 }
+FRAMES = 300  # of a film: some seconds of work, and less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
+_STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
 
 
-def save_benchmark_report(benchmark: Benchmark, path: str | Path) -> Path:
-    """Write the report of a benchmark; a file that is there is replaced.
+def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool = False) -> Path:
+    """Write the report of a benchmark as one file that needs no others; a file that is there is replaced.
 
     Args:
         benchmark: What ``run_benchmark`` returned.
         path: Where to, ``.html``.
+        video: Whether to film the first plan of every planner, which takes some seconds each, and not only draw its
+            end.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.
@@ -46,10 +50,11 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path) -> Path:
     parts = [
         f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
     ]
+    parts += [f"<p>{escape(trouble)}</p>" for trouble in troubles(benchmark)]
     for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
         parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
-    parts += _pictures(benchmark, place.parent)
+    parts += _motions(benchmark, video=video)
     head = f"<!doctype html><meta charset='utf-8'><title>{escape(suite.name)}</title><style>{_STYLE}</style>"
     write_file(place, "\n".join([head, *parts]))
     return place
@@ -60,8 +65,21 @@ def _table(benchmark: Benchmark, plant: str) -> str:
     head, *rows = table_rows(benchmark, plant)
     lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    note = "Medians [quartiles]; p: the chance of as large a difference from the reference planner, below 5 %."
+    other = compared_with(benchmark.results)
+    note = f"Medians [quartiles]; p: the chance of as large a difference from {other}, where it is below 5 %."
     return "\n".join([*lines, f"</table><p>{note}</p>"])
+
+
+def troubles(benchmark: Benchmark) -> list[str]:
+    """Say of every planner without a plan for some problems what came of those, and what it said first."""
+    found = []
+    for name, rows in benchmark.results.items():
+        without = [row for row in rows if row["answer"] is None]
+        for ending in dict.fromkeys(row["ending"] for row in without):
+            of_it = [row for row in without if row["ending"] == ending]
+            said = f", problem {of_it[0]['problem']}: {of_it[0]['error']}" if of_it[0]["error"] else ""
+            found.append(f"{name}: {len(of_it)} of {len(rows)} {ending}{said}")
+    return found
 
 
 def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
@@ -104,31 +122,31 @@ def _boxes(benchmark: Benchmark, plant: str) -> str:
         axes.boxplot([[row[key] for row in rows if key in row] for rows in values.values()])
         axes.set_xticks(range(1, len(values) + 1), list(values), rotation=30, fontsize=7)
         axes.set_title(FIGURES[key], fontsize=9)
-        if key == "planning_ms":
+        if key.startswith("planning"):
             axes.set_yscale("log")
     picture = io.StringIO()
     figure.savefig(picture, format="svg", metadata={"Date": None})
     return picture.getvalue().partition("?>\n")[2]
 
 
-def _pictures(benchmark: Benchmark, folder: Path) -> list[str]:
-    """Draw the end of the first plan of each planner that could be executed, where this machine can draw."""
+def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
+    """Show the first plan of each planner that could be executed, where this machine can draw."""
     parts = []
     for name, rows in benchmark.results.items() if benchmark.plants else ():
         plant = benchmark.plants[0]
         index = next((row["problem"] for row in rows if _was_executed(row, plant.name)), None)
         if index is None:
             continue
-        file = folder / f"{name}.png"
+        task = benchmark.problems[index], rows[index]["answer"], benchmark.lead and benchmark.lead[index]
+        what = f"{escape(name)}, problem {index}"
         try:
-            _draw(benchmark, rows[index], plant, file)
+            shown, text = _shown(task, plant, video=video)
         except MachineError as error:
             return [f"<p>No pictures: {escape(str(error))}</p>"]
-        data = base64.b64encode(file.read_bytes()).decode()
-        parts.append(
-            f"<h3>{escape(name)}, problem {index}, at the end of its plan</h3><img src='data:image/png;base64,{data}'>"
-        )
-        file.unlink()
+        except CnpgenError as error:  # a line that was damaged since
+            parts.append(f"<p>{what}: no picture: {escape(str(error))}</p>")
+            continue
+        parts.append(f"<figure>{shown}<figcaption>{what}, {text}</figcaption></figure>")
     return parts
 
 
@@ -137,8 +155,24 @@ def _was_executed(row: dict[str, Any], plant: str) -> bool:
     return executed is not None and "failure" not in executed
 
 
-def _draw(benchmark: Benchmark, row: dict[str, Any], plant: Plant, file: Path) -> None:
-    problem, lead = benchmark.problems[row["problem"]], benchmark.lead and benchmark.lead[row["problem"]]
-    answer = answer_from_dict(problem, row["answer"])
-    scene, reference, execution = execution_of(problem, answer, lead, plant)
-    save_picture(file, scene, execution, reference.ticks)
+def _shown(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
+    """Execute a plan; return what shows its end, or the whole of it, and what is to be said of that."""
+    scene, reference, execution = execution_of(task, plant)
+    with tempfile.TemporaryDirectory() as folder:
+        picture, film = Path(folder) / "end.png", Path(folder) / "plan.mp4"
+        save_picture(picture, scene, execution, reference.ticks)
+        still, text = _embedded(picture, "image/png"), "at the end of its plan"
+        if video:
+            try:
+                save_film(film, scene, execution, reference.ticks, most=FRAMES)
+            except MachineError as error:
+                text += f"; no film: {escape(str(error))}"
+                film.unlink(missing_ok=True)
+        if not film.exists():
+            return f"<img src='{still}'>", text
+        source = _embedded(film, "video/mp4")
+    return f"<video controls loop muted poster='{still}' src='{source}'></video>", "slowed down"
+
+
+def _embedded(file: Path, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(file.read_bytes()).decode()}"

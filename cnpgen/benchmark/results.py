@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.planner import Answer
 from cnpgen.benchmark.statistics import FIGURES
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
@@ -158,7 +157,7 @@ def _whole_lines(path: Path) -> list[str]:
     return found
 
 
-def answer_to_dict(answer: Answer) -> dict[str, Any] | None:
+def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
     """Write an answer for JSON; numbers read back as the same float64."""
     if isinstance(answer, Plans):
         return {
@@ -166,17 +165,22 @@ def answer_to_dict(answer: Answer) -> dict[str, Any] | None:
             "path_control_points": _rows(answer.path_control_points[0]),
             "rate_control_points": _rows(answer.rate_control_points[0]),
         }
-    if answer is None:
-        return None
-    return {name: _rows(values) for name, values in vars(answer).items() if isinstance(values, np.ndarray)}
+    return {name: _rows(values) for name in _SAMPLES if (values := getattr(answer, name)) is not None}
 
 
 def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Trajectory:
-    """Read an answer for one boundary problem back."""
+    """Read an answer for one boundary problem back.
+
+    Raises:
+        UsageError: It is none: a shape is wrong, or its joints are others than those of the problem.
+    """
     known = _PLAN.keys() - {"degree"} if "degree" in content else _SAMPLES.keys() & content.keys()
     numbers = {name: np.array(content[name], float) for name in known}
     if "degree" not in content:
-        return Trajectory(**numbers)
+        trajectory = Trajectory(**numbers)
+        if (joints := trajectory.q.shape[1]) != (wanted := problem.boundary.start_q.shape[1]):
+            raise UsageError(f"the problem has {wanted} joints, its answer {joints}")
+        return trajectory
     return make_plans(
         problem.problem,
         problem.boundary,

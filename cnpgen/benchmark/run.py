@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.execution import Task, execute_answer
+from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.process import Attempt, PlannerProcess
-from cnpgen.benchmark.results import Results, answer_from_dict, answer_to_dict, open_results
+from cnpgen.benchmark.results import Results, answer_from_dict, open_results
 from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
@@ -220,10 +220,10 @@ def _row(index: int, problem: Plans, attempt: Attempt) -> dict[str, Any]:
         "planning_s": attempt.seconds,
         "planning_cpu_s": attempt.cpu_seconds,
         "error": attempt.error,
-        "answer": answer_to_dict(attempt.answer),
+        "answer": attempt.answer,
     }
-    if attempt.answer is not None:  # judged as it is read back: by the problem's boundary conditions, not by its own
-        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, row["answer"])))
+    if attempt.answer is not None:  # by the problem's boundary conditions, not by those that came with the answer
+        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, attempt.answer)))
     return row
 
 
@@ -257,12 +257,8 @@ def _execute_all(
     waiting = list(results.unexecuted(plant.name, len(problems)))
     if not waiting:
         return
-    tasks = (_task(problems[index], results.rows[index], lead and lead[index]) for index in waiting)
+    tasks = ((problems[index], results.rows[index]["answer"], lead and lead[index]) for index in waiting)
     with closing(team.share_out(partial(execute_answer, plant=plant), tasks, ordered=True)) as found:
         for done, (index, executed) in enumerate(zip(waiting, found, strict=True), start=1):
             results.append({"problem": index, "executed": {plant.name: executed.to_dict()}})
             tell(len(waiting), done)
-
-
-def _task(problem: Plans, row: dict[str, Any], lead: Lead | None) -> Task:
-    return problem, answer_from_dict(problem, row["answer"]), lead

@@ -1,6 +1,6 @@
 """What the results of a benchmark amount to: ratios, medians, quartiles, and whether differences are chance."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -72,11 +72,11 @@ def summarise_results(
     Returns:
         Planner -> ``{"ratios": ..., "figures": ...}``. A ratio has ``count``, ``of`` and ``share``; a figure has
         ``median``, ``q1``, ``q3`` and ``of``, of how many problems it is known. Both have ``p``, the probability of
-        as large a difference from the reference planner by chance: by McNemar's exact test, and by Wilcoxon's signed
-        ranks over the problems that both have a figure of.
+        as large a difference from the planner ``compared_with`` by chance: by McNemar's exact test, and by Wilcoxon's
+        signed ranks over the problems that both have a figure of.
     """
     values = {name: [values_of(row, plant) for row in rows] for name, rows in results.items()}
-    reference = REFERENCE if REFERENCE in values else next(iter(values), "")
+    reference = compared_with(values)
     known = {key for rows in values.values() for row in rows for key in row}
     return {
         name: {
@@ -89,6 +89,12 @@ def summarise_results(
         }
         for name, rows in values.items()
     }  # fmt: skip
+
+
+def compared_with(planners: Iterable[str]) -> str:
+    """Return the planner that others are compared with: the first one, unless the reference is among them."""
+    names = list(planners)
+    return REFERENCE if REFERENCE in names else next(iter(names), "")
 
 
 def _ratio(key: str, rows: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -36,11 +36,14 @@ class Trajectory:
     ddq: Array | None = None
 
     def __post_init__(self) -> None:
-        checked_samples(self.t, self.q, self.dq)
+        t, q, dq = checked_samples(self.t, self.q, self.dq)
+        ddq = None
         if self.ddq is not None:
-            if self.dq is None:
+            if dq is None:
                 raise UsageError("a trajectory with accelerations needs velocities, too")
-            checked_samples(self.t, self.q, self.ddq)
+            ddq = checked_samples(t, q, self.ddq)[2]
+        for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq)):
+            object.__setattr__(self, name, values)  # lists are as good as arrays
         if self.t[0] != 0:
             raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s")
 

@@ -40,6 +40,7 @@ def add(commands: "Commands[Parser]") -> None:
         type=Path,
         help="execute them in this clone of the Air Hockey Challenge, too",
     )
+    option("--video", action="store_true", help="film the first plan of every planner for the report")
     option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="for each problem (default: 60s)")
     text = "processes that execute, and with --engine plan; default one per available core"
     option("--workers", metavar="W", type=values.positive, help=text)
@@ -61,9 +62,11 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.plant or arguments.environment) and not arguments.simulate:
         option = "--plant" if arguments.plant else "--environment"
         raise UsageError(f"{option} says where plans are executed: it goes with --simulate only")
+    if arguments.video and not arguments.simulate:
+        raise UsageError("--video films plans as they are executed: it goes with --simulate only")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
-    report = save_benchmark_report(found, folder / "report.html")
+    report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
     return 0
@@ -119,12 +122,12 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
 
 def _text(found: "Benchmark") -> str:
     """Lay out a table per plant, a column per planner."""
-    from cnpgen.benchmark.report import table_rows
+    from cnpgen.benchmark.report import table_rows, troubles
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
-    return "\n\n".join([head, *("\n".join(lines) for lines in tables)])
+    return "\n\n".join([head, *("\n".join(lines) for lines in tables), *filter(None, ["\n".join(troubles(found))])])
 
 
 def _listing(*, as_json: bool) -> str:
@@ -132,17 +135,25 @@ def _listing(*, as_json: bool) -> str:
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
     from cnpgen.cli.describe import table
-    from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.schema import registry
 
-    planners = {
-        name: kind_summary(registry.load(registry.PLANNERS, name)) for name in registry.names(registry.PLANNERS)
-    }
     found = {
         "suites": {name: load_suite(name).title for name in list_suites()},
-        "planners": planners,
+        "planners": {name: _summary(name) for name in registry.names(registry.PLANNERS)},
         "plants": {plant.name: plant.title for plant in PLANTS.values()},
     }
     if as_json:
         return json.dumps(found, indent=2)
     return "\n\n".join("\n".join([what, *table(list(names.items()), indent="  ")]) for what, names in found.items())
+
+
+def _summary(planner: str) -> str:
+    """Say in a line what a planner does, or why it cannot be used: it may be anybody's."""
+    from cnpgen.cli.describe_keys import kind_summary
+    from cnpgen.errors import CnpgenError
+    from cnpgen.schema import registry
+
+    try:
+        return kind_summary(registry.load(registry.PLANNERS, planner))
+    except CnpgenError as error:
+        return f"cannot be used: {error}"

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cnpgen.benchmark.report import save_benchmark_report
+from cnpgen.benchmark.report import save_benchmark_report, troubles
 from cnpgen.benchmark.results import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run import run_benchmark
 from cnpgen.benchmark.suite import load_suite
@@ -43,6 +43,8 @@ class Moody(BenchmarkPlanner):
             8: lambda problem: problem,
             9: lambda problem: Trajectory(np.array([0, 1e4]), np.zeros((2, 6))),
             10: lambda problem: good(others[50]),
+            11: lambda problem: type("Mine", (Trajectory,), {})([0, 1.0], np.zeros((2, 6))),
+            12: lambda problem: print("{not json") or Trajectory(np.array([0, 1.0]), np.full((2, 6), 1e200)),
         }
         return lambda problem: ways[int(problem.sample_id[0])](problem)
 """
@@ -63,19 +65,53 @@ def moody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_whatever_a_planner_does_costs_its_own_row_only(
-    moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("cnpgen.benchmark.process.SPARE", 0.5)
-    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=11, time_limit=0.2)
+    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=13, time_limit=0.2)
     rows = found.results[moody]
     endings = [row["ending"] for row in rows]
     assert endings[:7] == ["crashed", "planned", "failed", "failed", "no plan", "out of time", "planned"]
-    assert endings[7:] == ["failed", "planned", "planned", "planned"]
+    assert endings[7:] == ["failed", *["planned"] * 5]
+    assert capfd.readouterr().out == ""  # what planners print does not mix with results
     assert rows[7]["error"] == "the problem has 6 joints, its answer 3"
-    assert [row["verdict"]["reason"] for row in rows[8:]] == ["not finite", "too long", "boundary conditions"]
+    assert [row["verdict"]["reason"] for row in rows[8:]] == [
+        "not finite",
+        "too long",
+        *["boundary conditions"] * 3,
+    ]
     assert "garbage" in rows[2]["error"]
     assert "ZeroDivisionError" in rows[3]["error"]
     assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
+
+
+@pytest.mark.parametrize("way", ["1 / 0", "os._exit(1)"])
+def test_a_planner_that_cannot_even_be_prepared_costs_its_own_rows_only(moody: str, way: str, tmp_path: Path) -> None:
+    text = (tmp_path / "moody.py").read_text(encoding="utf-8")
+    (tmp_path / "moody.py").write_text(
+        text.replace("good, others =", f"{way}\n        good, others ="), encoding="utf-8"
+    )
+    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody, "cnp-b"], n=2)
+    assert [row["ending"] for row in found.results[moody]] == ["crashed"] * 2
+    assert [row["ending"] for row in found.results["cnp-b"]] == ["planned"] * 2
+    said = {"1 / 0": "ZeroDivisionError: division by zero", "os._exit(1)": "its process ended, or it did not get ready"}
+    assert troubles(found) == [f"moody: 2 of 2 crashed, problem 0: before the first problem: {said[way]}"]
+
+
+@pytest.mark.slow
+def test_a_report_leaves_out_the_picture_of_a_line_that_was_damaged(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal"], workers=1)
+    file = tmp_path / "cnp-b.jsonl"
+    head, planned, *others = map(json.loads, file.read_text().splitlines())
+    planned["answer"]["path_control_points"] = [row[:3] for row in planned["answer"]["path_control_points"]]
+    file.write_text("".join(json.dumps(row) + "\n" for row in (head, planned, *others)))
+    found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal", "heavier"], workers=1)
+    failure = found.results["cnp-b"][0]["executed"]["heavier"]["failure"]
+    assert failure.startswith("path_control_points has 3 joints, but 'airhockey' plans 6")
+    report = save_benchmark_report(found, tmp_path / "report.html").read_text()
+    assert "cnp-b, problem 0: no picture: path_control_points has 3 joints" in report
+    assert "1 of 1 (paper: 100 %)" in report
 
 
 @pytest.mark.slow
@@ -94,7 +130,7 @@ def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path:
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) -> None:
+def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
     file = tmp_path / "cnp-b.jsonl"
@@ -116,9 +152,13 @@ def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path) ->
     assert all(row["executed"]["nominal"]["scored"] for row in again.results["cnp-b"])
     third = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=3, plants=["nominal"], workers=1)
     assert third.results == again.results
-    report = save_benchmark_report(third, tmp_path / "report.html").read_text()
+    monkeypatch.setattr("cnpgen.benchmark.report.FRAMES", 3)
+    report = save_benchmark_report(third, tmp_path / "report.html", video=True).read_text()
     assert "paper: 100 %" in report
     assert "<svg" in report
+    assert "src='data:video/mp4;base64," in report or "No pictures: this machine cannot draw" in report
+    assert not re.search("(src|href)=['\"](?!data:|#)", report)
+    assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnp-b.jsonl", "report.html"]
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import pytest
 
 from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.judging import judge_answer
+from cnpgen.benchmark.results import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
@@ -105,7 +106,10 @@ def test_jerks_are_judged_where_a_problem_limits_them(known: str) -> None:
 def test_a_plan_and_its_samples_are_executed_alike() -> None:
     pytest.importorskip("mujoco")
     plan = stored("hit")
-    one, other = (execute_answer((plan, each, None), plant=PLANTS["nominal"]) for each in (plan, sampled(plan, 400)))
+    one, other = (
+        execute_answer((plan, answer_to_dict(each), None), plant=PLANTS["nominal"])
+        for each in (plan, sampled(plan, 400))
+    )
     assert other.hit_time == one.hit_time
     assert other.puck_speed == pytest.approx(one.puck_speed, rel=1e-3)
     assert other.z_error == pytest.approx(one.z_error, rel=0.02)
@@ -115,6 +119,6 @@ def test_what_cannot_be_executed_says_so() -> None:
     pytest.importorskip("mujoco")
     plan = stored("transport")
     slow = sampled(plan, 10)
-    found = execute_answer((plan, Trajectory(slow.t * 1000, slow.q), None), plant=PLANTS["nominal"])
+    found = execute_answer((plan, answer_to_dict(Trajectory(slow.t * 1000, slow.q)), None), plant=PLANTS["nominal"])
     assert "cannot be executed" in found.failure
     assert judge_answer(plan, Trajectory(slow.t * 1000, slow.q)).reason == "too long"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.benchmark.execution import execution_of, joined
+from cnpgen.benchmark.results import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.simulator.reference import states_of
 from cnpgen.benchmark.suite import list_suites, load_suite
@@ -41,7 +42,7 @@ def test_the_opposite_puck_is_hit_and_the_first_one_left_alone() -> None:
     problems, lead = suite.problems(1)
     assert lead is not None
     plan = refine_plans(Planner(suite.model).plan_batch(problems.boundary, columns=problems.columns), workers=1).plans
-    scene, reference, execution = execution_of(problems, plan, lead[0], PLANTS["nominal"])
+    scene, reference, execution = execution_of((problems, answer_to_dict(plan), lead[0]), PLANTS["nominal"])
     assert suite.turns is not None
     np.testing.assert_allclose(scene.puck, suite.turns.pucks.positions()[:, -1], atol=1e-6)
     assert reference.duration == pytest.approx(0.15 + plan.duration[0])

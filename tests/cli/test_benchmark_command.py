@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.main import main
+from cnpgen.schema import registry
 
 
 def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture[str]) -> None:
@@ -14,6 +15,24 @@ def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture
     assert {"hits-81", "hits-110", "heavy-100"} <= found["suites"].keys()
     assert {"cnp-b", "cnp-b+refine", "solve", "trajopt", "aqp"} <= found["planners"].keys()
     assert list(found["plants"]) == ["nominal", "heavier", "delayed"]
+
+
+def test_the_list_says_of_a_planner_that_cannot_be_imported_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = tmp_path / "mine-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text("[cnpgen.planners]\nmine = no_such_module:Mine\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    registry.installed.cache_clear()
+    try:
+        assert main(["benchmark", "--list", "--json"]) == 0
+    finally:
+        registry.installed.cache_clear()
+    found = json.loads(capsys.readouterr().out)
+    assert "No module named 'no_such_module'" in found["planners"]["mine"]
+    assert "cnp-b" in found["planners"]
 
 
 @pytest.mark.slow
@@ -38,3 +57,5 @@ def test_mistakes_are_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "which suite?" in capsys.readouterr().err
     assert main(["benchmark", "hits-81", "--plant", "heavier", "-o", str(tmp_path)]) == 2
     assert "goes with --simulate only" in capsys.readouterr().err
+    assert main(["benchmark", "hits-81", "--video", "-o", str(tmp_path)]) == 2
+    assert "--video films plans as they are executed: it goes with --simulate only" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """``cnpgen simulate``: what it prints, its exit codes, its pictures."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,17 @@ def test_pictures_are_drawn_or_the_reason_is_said_after_the_results(
         return
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert film.read_bytes().startswith(b"GIF")
+
+
+def test_without_ffmpeg_there_is_no_film_and_the_reason_is_said(
+    carried: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cnpgen.benchmark.simulator.picture.AFTER", -0.99)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert main(["simulate", str(carried), "--workers", "1", "--video", str(tmp_path / "film.mp4")]) == 3
+    said = capsys.readouterr().err
+    assert "pip install 'imageio[ffmpeg]'" in said or "cannot draw without a screen" in said
 
 
 def test_mistakes_are_said_in_a_line(carried: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,7 +46,7 @@ def save_picture(path: Path, scene: Scene, execution: Execution, tick: int) -> N
         raise machine_error("write", path, error) from error
 
 
-def save_film(path: Path, scene: Scene, execution: Execution, ticks: int) -> None:
+def save_film(path: Path, scene: Scene, execution: Execution, ticks: int, *, most: int | None = None) -> None:
     """Draw a film of a plan and of the second after it, four times slower than it was.
 
     Args:
@@ -54,13 +54,15 @@ def save_film(path: Path, scene: Scene, execution: Execution, ticks: int) -> Non
         scene: What was simulated.
         execution: What happened.
         ticks: How long the plan is.
+        most: How many pictures it may have; a longer motion is shown faster. As many as it takes by default.
 
     Raises:
-        MachineError: As ``save_picture`` does.
+        MachineError: As ``save_picture`` does, or ffmpeg is missing.
     """
     imageio = _imageio()
     last = min(ticks + round(AFTER / TICK), len(execution.states))
-    chosen = range(0, last, round(1 / (FRAMES * SLOWER * TICK)))
+    step = round(1 / (FRAMES * SLOWER * TICK))
+    chosen = range(0, last, step if most is None else max(step, -(-last // most)))
     with _drawing(scene) as draw:
         images = [draw(execution, tick) for tick in chosen]
     options = (
@@ -70,6 +72,11 @@ def save_film(path: Path, scene: Scene, execution: Execution, ticks: int) -> Non
         imageio.mimsave(path, images, **options)
     except OSError as error:
         raise machine_error("write", path, error) from error
+    except (ImportError, RuntimeError, ValueError) as error:  # so imageio says that it has no ffmpeg
+        text = " ".join(str(error).split())
+        raise MachineError(
+            f"no film {path.suffix} can be made here ({text:.200}): pip install 'imageio[ffmpeg]'"
+        ) from error
 
 
 def _imageio() -> Any:

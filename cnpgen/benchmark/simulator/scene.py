@@ -76,7 +76,8 @@ def scene_xml(scene: Scene) -> str:
     return f"""<mujoco model="{scene.problem.name}">
 <compiler angle="radian" autolimits="true"/>
 <option timestep="{STEP}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
-<visual><global offwidth="1280" offheight="960"/><headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
+<visual><global offwidth="1280" offheight="960"/><quality shadowsize="1024"/>
+<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
 <default><geom contype="0" conaffinity="0" mass="0"/></default>
 <asset>{"".join(_meshes(scene))}</asset>
 <worldbody>
