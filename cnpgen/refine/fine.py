@@ -81,6 +81,12 @@ class FineCheck:
         slower = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
         return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), slower)
 
+    def bounds_at_rest(self, task: Task) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Return which residuals are clearances of capsules, and bounds half way with tolerances, shape (m,) each."""
+        bounds, middle = self._bounds.of(task.start_xyz), POINTS // 2
+        allowed = np.where(self._bounds.capsules, 0.0, self._bounds.allowed)
+        return self._bounds.capsules, bounds.lower[middle] - allowed, bounds.upper[middle] + allowed
+
     def refutes_ends(self, task: Task) -> bool:
         """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
         return bool(np.nanmax(self._excess_of_ends(task)) > CERTAIN)

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.fine import FineCheck
+from cnpgen.refine.seeds import Space, along_way, find_way
 from cnpgen.refine.solver import starts
 from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate, Tightening
 from cnpgen.refine.solver.compiled import load_steps
 from cnpgen.refine.solver.criterion import Criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.hulls import Hulls, HullTranscription, keeps_clear
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT, Result, Settings, minimise
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
@@ -34,6 +36,8 @@ EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the e
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
+TOUCHING = 0.02  # m: as deep as links may be in a plan that is gone on from
+SEEDS = 3  # ways round obstacles that are tried
 ROUNDS = 4  # from a motion that was slowed down; most need one
 FROM_NOTHING, CROWDED = 0.1, 0.05  # shares of the tolerance from nothing, where small steps still lead far
 
@@ -181,7 +185,12 @@ class Refiner:
         strict = self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED)
         yield strict
         if not self.check.refutes_ends(task):
-            yield from self._from_others(task, x, strict if strict.is_better(best) else best)
+            best = strict if strict.is_better(best) else best
+            for other in self._from_others(task, x, best):
+                yield other
+                best = other if other.is_better(best) else best
+            if task.until == np.inf and keeps_clear(self.problem, self.robot):
+                yield from self._around(task, best)
 
     def _iterated_on(self, task: Task, best: Attempt) -> Attempt:
         """Go on from a motion that had to be slowed down, for as long as that gains.
@@ -215,13 +224,51 @@ class Refiner:
         if task.at_rest:  # what is left to be said of it is why no speed is slow enough
             yield last
 
-    def minimise(self, task: Task, which: Pass, x: Array) -> Result:
-        """Run one pass from variables x, shape (nx,)."""
+    def _around(self, task: Task, best: Attempt) -> Iterator[Attempt]:
+        """Yield plans along ways round the obstacles, and plans that keep the links clear, not their capsules.
+
+        ``best`` is the best one so far; where its links hardly touch anything, it is what is gone on from first.
+        """
+        hulls = Hulls(self.problem, self.robot)
+        touching = hulls.depth(self.check.transcription(task).positions(best.x), task.tops) < TOUCHING
+        if touching:
+            yield from self._on_hulls(task, best, hulls)
+        for start in self._ways(task, hulls):
+            first = self._attempt(task, self.passes.given, start.x, Outcome.RESTARTED)
+            yield first
+            yield from self._on_hulls(task, first if first.excess <= 1 else start, hulls)
+        if not touching:
+            yield from self._on_hulls(task, best, hulls)
+
+    def _on_hulls(self, task: Task, start: Attempt, hulls: Hulls) -> Iterator[Attempt]:
+        """Yield plans with clear links: from a given one, and once more with more room."""
+        first = self._attempt(task, self.passes.given, start.x, Outcome.RESTARTED, hulls)
+        yield first
+        if first.excess <= 1:
+            yield self._attempt(task, self.passes.strict, first.x, Outcome.RESTARTED, hulls)
+
+    def _ways(self, task: Task, hulls: Hulls) -> Iterator[Attempt]:
+        """Yield motions along ways round the obstacles, slow enough where they may be."""
+        if self.check.equalities:  # hardly any configuration meets them
+            return
+        space, ends = Space(self.stage, hulls, *self.check.bounds_at_rest(task), task.tops), task.boundary
+        for seed in range(SEEDS):
+            way = find_way(ends.start_q[0], ends.goal_q[0], self.robot, space.free, seed=seed)
+            if way is None:
+                return
+            x = _variables(along_way(way, ends, self.robot.velocity_limit, self.spec))
+            yield self._measured(task, x, Outcome.RESTARTED, at_any_cost=True)
+
+    def minimise(self, task: Task, which: Pass, x: Array, hulls: Hulls | None = None) -> Result:
+        """Run one pass from variables x, shape (nx,); with hulls these are kept clear in the place of capsules."""
         settings, motion = which.settings, self.transcription(task, which)
         ends = motion.end_residuals()
         bounds = self.bounds(task, which, ends)
         if not np.nanmax(bounds.beyond(ends)) < LOST:
             settings = replace(settings, max_iterations=0)
+        if hulls is not None:
+            motion = HullTranscription(self.stage, motion.grid, hulls, boundary=task.boundary, tops=task.tops)
+            bounds = self._bounds[which].on_hulls(bounds, hulls.least)
         return minimise(motion, bounds, x, settings, until=task.until)
 
     def transcription(self, task: Task, which: Pass) -> Transcription:
@@ -244,8 +291,8 @@ class Refiner:
                 return result
         return self.minimise(task, self.passes.first, self.straight(task))
 
-    def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome) -> Attempt:
-        result = self.minimise(task, which, x)
+    def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, hulls: Hulls | None = None) -> Attempt:
+        result = self.minimise(task, which, x, hulls)
         return self._measured(task, result.x, outcome, result.iterations)
 
     def _measured(

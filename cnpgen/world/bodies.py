@@ -1,6 +1,7 @@
 """Distances of the pieces of a robot's shape from obstacles and from each other."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,28 @@ Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
 
 NO_SHAPE = 'a constraint is about the shape of the robot, which has none: it needs geometry = "urdf" in [robot]'
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Where bodies are near each other, C times.
+
+    Attributes:
+        pair: Indices of the pairs, shape (C,).
+        k: Indices of the states, shape (C,).
+        distance: Signed distances [m], shape (C,).
+        away: Unit vectors in which the second body is away from the first, shape (C, 3).
+        points: On the first and on the second, without what they are wrapped in, where they are nearest [m], shape
+            (C, 2, 3).
+        joints: Numbers of the joints that move them, shape (C, 2); 0 for what stands still.
+    """
+
+    pair: NDArray[np.intp]
+    k: NDArray[np.intp]
+    distance: Array
+    away: Array
+    points: Array
+    joints: NDArray[np.intp]
 
 
 class Bodies:
@@ -85,6 +108,37 @@ class Bodies:
             return self._apart(*ends[pair], direction, which)
 
         return PairDistances(self._bounds(pairs), measure, separate)
+
+    def contacts(self, pairs: Pairs, within: float) -> Contacts:
+        """Measure all that is near: pairs of bodies at states where their signed distance is below ``within`` [m].
+
+        What is further apart somewhere is so in a direction that settles most other states, too.
+
+        Args:
+            pairs: ``from_obstacles`` or ``among_links``.
+            within: The distance.
+        """
+        near, found = ~(self._bounds(pairs) >= within), list[Any]()
+        for pair in np.flatnonzero(near.any(axis=1)).tolist():
+            (a, b), doubtful = pairs[pair].tolist(), np.flatnonzero(near[pair])
+            while len(doubtful):
+                k, doubtful = int(doubtful[0]), doubtful[1:]
+                distance, direction = self._measure(a, b, k)
+                if distance < within:
+                    found.append((pair, k, distance, direction, self._coal.witnesses()))
+                elif len(doubtful) and np.isfinite(direction).all():
+                    doubtful = doubtful[~(self._apart(a, b, direction, doubtful) >= within)]
+        return self._gathered(pairs, [each for each in found if np.isfinite(each[3]).all()])
+
+    def _gathered(self, pairs: Pairs, found: list[Any]) -> Contacts:
+        """Gather pairs, states, distances, directions in the frames of the first bodies, and points."""
+        columns = zip(*found, strict=True) if found else [()] * 5
+        pair, k, distance, direction, points = (np.array(each) for each in columns)
+        pair, k = pair.astype(np.intp), k.astype(np.intp)
+        frames = np.array(self._frames, np.intp)[pairs[pair]]
+        away = np.einsum("cij,cj->ci", self._rotations[frames[:, 0], ..., k], direction.reshape(-1, 3))
+        joints = np.where(frames < len(self._rotations) - len(self._solids), frames, 0)
+        return Contacts(pair, k, distance, away, points.reshape(-1, 2, 3), joints)
 
     def spread(self, joint: int) -> float:
         """How far from a joint's origin what it moves reaches at most [m]."""

@@ -80,3 +80,7 @@ class CertifiedDistance:
             if abs(found - a.radius - b.radius - certified) <= CERTAIN:
                 break
         return best, away
+
+    def witnesses(self) -> tuple[Array, Array]:
+        """Return the points at which the two cores measured last are nearest to each other [m], shape (3,) each."""
+        return np.array(self._result.getNearestPoint1()), np.array(self._result.getNearestPoint2())

@@ -29,8 +29,9 @@ def clear_states(bounds: Array, least: float, measure: Measure, separate: Separa
         Shape (K,); False where a distance cannot be measured.
     """
     clear = np.ones(bounds.shape[1], bool)
-    for pair, bound in enumerate(bounds):
-        doubtful = np.flatnonzero(clear & ~(bound >= least))
+    far = bounds >= least
+    for pair in np.flatnonzero(~far.all(axis=1)).tolist():
+        doubtful = np.flatnonzero(clear & ~far[pair])
         while len(doubtful):
             k, doubtful = int(doubtful[0]), doubtful[1:]
             distance, direction = measure(pair, k)

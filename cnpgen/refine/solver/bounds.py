@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.needs import measured_needs
+from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.solver.residuals import residual_scale
+from cnpgen.refine.solver.residuals import DISTANCE, residual_scale
 
 if TYPE_CHECKING:
     from cnpgen.world.state import World
@@ -85,6 +87,7 @@ class BoundsTemplate:
         allowed: What the verdict allows residuals to exceed, in scaled units, shape (m,); ``UNTOLD`` of conditions that
             ask for more than is meant, of which the verdict knows nothing.
         needs: The highest derivative of q that each residual depends on, shape (m,).
+        capsules: Which residuals are clearances of the links' capsules, or of the paper's, shape (m,).
     """
 
     def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
@@ -92,13 +95,16 @@ class BoundsTemplate:
         needs = measured_needs(forms, world, jerk=problem.uses_jerk)  # the world is left as the bounds are read off
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
         tables = [_bounds(*pair, s, tightening, need) for pair, need in zip(pairs, needs, strict=True)]
+        self._tightening = tightening
         self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
         self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
         self._funnels = list(_funnels(pairs))
         self.conditions = [condition for _, condition in pairs]
         self.allowed = np.concatenate([_allowed(*pair) for pair in pairs])
-        self.needs = np.repeat(needs, [len(each.g) for each in self.conditions])
+        widths = [len(each.g) for each in self.conditions]
+        self.needs = np.repeat(needs, widths)
+        self.capsules = np.repeat([isinstance(each, RobotClearance | SelfClearance) for each, _ in pairs], widths)
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
         self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs >= 2
 
@@ -113,6 +119,22 @@ class BoundsTemplate:
         """
         bounds = self._of(start_tip)
         return bounds if ends is None else self._eased(bounds, ends)
+
+    def on_hulls(self, bounds: Bounds, least: Array) -> Bounds:
+        """Return bounds without those of capsules, and with further columns for distances of the links' hulls.
+
+        Args:
+            bounds: What ``of`` returned.
+            least: What the distances must be at least [m], shape (columns,).
+        """
+        lower = (least + _inside(self._s, self._tightening)[:, None]) / DISTANCE
+        lower[self._s == 1] = -np.inf
+        free = np.where(self.capsules, np.inf, 0.0)
+        return Bounds(
+            np.asfortranarray(np.hstack([bounds.lower - free, lower])),
+            np.asfortranarray(np.hstack([bounds.upper + free, np.full_like(lower, np.inf)])),
+            np.asfortranarray(np.hstack([bounds.sharp, np.zeros(lower.shape, bool)])),
+        )
 
     def _eased(self, bounds: Bounds, ends: Array) -> Bounds:
         lower, upper = bounds.lower, bounds.upper
@@ -175,8 +197,13 @@ def _bounds(
         band = tightening.band * constraint.tolerance / scale
         lower, upper = lower - band, upper + band
     else:
-        inside = tightening.clearance * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None] / scale
+        inside = _inside(s, tightening)[:, None] / scale
         lower, upper = lower + inside, upper - inside
     if needs < 2:  # fixed by the boundary conditions
         lower[s == 1], upper[s == 1] = -np.inf, np.inf
     return lower, upper
+
+
+def _inside(s: Array, tightening: Tightening) -> Array:
+    """By how much clearances are tightened [m], shape (K,)."""
+    return np.asarray(tightening.clearance * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1))

@@ -107,6 +107,10 @@ class Transcription:
         """Return the variables of a motion; its boundary control points are replaced by the exact ones."""
         return np.concatenate([path[3 : self._fixed].ravel(), np.log(rate)])
 
+    def positions(self, x: Array) -> Array:
+        """Return joint positions on the grid [rad], shape (n, K)."""
+        return self._at(x)[0][: self.n]
+
     def value(self, x: Array) -> tuple[float, Array]:
         """Evaluate what is minimised, and residuals (K, m), without derivatives."""
         cost, g = self.measured(x)
