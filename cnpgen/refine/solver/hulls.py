@@ -19,7 +19,7 @@ from cnpgen.refine.solver.transcription import Linearisation, ResidualKernels, T
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.bodies import Bodies, Contacts
-from cnpgen.world.trace import trace
+from cnpgen.world.trace import Trace
 
 if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem
@@ -49,7 +49,7 @@ class Hulls:
     def __init__(self, problem: "Problem", robot: "Robot") -> None:
         assert robot.shape is not None
         self._model, self._obstacles, self._n = robot.model, problem.obstacle, robot.n
-        self._data = self._model.createData()
+        self._data, self._trace = self._model.createData(), Trace(self._model)
         self._bodies = Bodies(robot.shape, len(problem.obstacle), robot.n)
         links = [piece.link for piece in robot.shape.pieces]
         names = [*links, *range(len(problem.obstacle))]
@@ -99,7 +99,7 @@ class Hulls:
         self._place(q, tops)
         met = np.ones(q.shape[1], bool)
         for pairs, _, least in self._groups if of_all else self._unseen:
-            met &= self._bodies.clear(pairs, least)
+            met &= self._bodies.between(pairs).clear(least)
         return met
 
     def depth(self, q: Array, tops: Array) -> float:
@@ -122,8 +122,7 @@ class Hulls:
         return slopes.transpose(2, 1, 0)
 
     def _place(self, q: Array, tops: Array) -> None:
-        rotations, positions = trace(self._model, self._data, q, list(range(self._n + 1)), n_turned=self._n + 1)
-        self._bodies.place(rotations, positions, solids_of(self._obstacles, tops))
+        self._bodies.place(*self._trace.poses(q), solids_of(self._obstacles, tops))
 
 
 class HullTranscription(Transcription):
