@@ -61,11 +61,11 @@ class Space:
         w, orders = np.zeros((width, count)), (width + 1) // (n + 1)
         w[:n], w[orders * n] = q, 1.0  # positions and the rate
         (g,) = self.stage.values(w, np.repeat(self.tops[:, None], count, axis=1))
-        met = np.asarray((g >= self.lower[:, None]) & (g <= self.upper[:, None]))
-        first = _first(~met[~self.capsules].all(axis=0))
+        met = (g >= self.lower[:, None]) & (g <= self.upper[:, None])
+        first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
             first = _first(~self.hulls.clear(q[:, :first], self.tops, of_all=False))
-        doubtful = np.flatnonzero(~met[self.capsules].all(axis=0)[:first])
+        doubtful = np.flatnonzero(~np.logical_and.reduce(met[self.capsules])[:first])
         if not len(doubtful):
             return first
         hit = _first(~self.hulls.clear(q[:, doubtful], self.tops))
