@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.kernels.cache import make_private, one_at_a_time
 from cnpgen.kernels.compiled import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
 from cnpgen.make.dataset import make_dataset
@@ -29,6 +30,7 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import Round
 from cnpgen.robots.robot import Robot
+from cnpgen.store.layout import MANIFEST
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
@@ -164,12 +166,17 @@ def tiny_recipe(name: str, **changes: Any) -> DatasetRecipe:
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Make a small dataset of a shipped recipe, once per session; not to be changed."""
+    """Make a small dataset of a shipped recipe, once for all processes that the tests run in; not to be changed."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "tiny"
+    make_private(shared)
 
     @cache
     def made(name: str) -> Path:
-        folder = tmp_path_factory.mktemp("tiny") / name
-        make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1)
+        folder = shared / name
+        with one_at_a_time(shared / f"{name}.lock"):
+            if not (folder / MANIFEST).exists():
+                make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1)
         return folder
 
     return made

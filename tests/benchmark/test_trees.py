@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.stats import norm
+import scipy  # which imports its statistics when they are asked for: that takes a second
 
 from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners import steering
@@ -167,7 +167,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences_and_the_likel
         difference = (value(parameters + 1e-6 * direction) - value(parameters - 1e-6 * direction)) / 2e-6
         assert gradient @ direction == pytest.approx(difference, rel=1e-6)
     given = forward(architecture.split(parameters), features)
-    logs = norm.logpdf(targets, given.path, LEAST + np.exp(given.log_rate)) + np.log(2 * np.pi) / 2
+    logs = scipy.stats.norm.logpdf(targets, given.path, LEAST + np.exp(given.log_rate)) + np.log(2 * np.pi) / 2
     assert found == pytest.approx(-logs.sum(axis=1).mean())
 
 

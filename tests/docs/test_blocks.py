@@ -3,10 +3,12 @@
 import configparser
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,15 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.make.dataset import make_dataset
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
-from tests.conftest import HANGING, some
+from tests.conftest import HANGING
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
 RUNNABLE = {"bash", "python", "toml"}
 
@@ -68,17 +72,37 @@ def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset("airhockey-hit", tmp_path_factory.mktemp("needed") / "hits", n=400, workers=1).folder
 
 
-@pytest.mark.parametrize("page", some(PAGES, 1, "slow"), ids=lambda page: page.name)
-def test_the_blocks_of_a_page_run_in_order(page: Path, needed: Path, tmp_path: Path) -> None:
+def shown(page: Path) -> Iterator[tuple[dict[str, str], str, str]]:
+    """List the blocks of a page that can be run here."""
     for marks, language, text in blocks(page):
-        if "needs" in marks and not (tmp_path / marks["needs"]).exists():
-            shutil.copytree(needed, tmp_path / marks["needs"])
         if "library" in marks and find_spec(marks["library"]) is None:
             continue  # .ci/run or the extended run has it
         if "program" in marks and shutil.which(marks["program"]) is None:
             continue  # not on every machine
         if "install" in marks or "test" in marks:
             continue  # .ci/run runs these two in fresh environments
+        yield marks, language, text
+
+
+def test_what_the_readme_shows_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process: most of what the README takes in a shell, which is in the slow run, is starting others."""
+    monkeypatch.chdir(tmp_path)
+    for _, language, text in shown(README):
+        if language == "python":
+            exec(compile(text, README.name, "exec"), {"__name__": "__main__"})
+        for line in text.splitlines() if language == "bash" else ():
+            command, _, otherwise = line.partition(" || ")
+            program, *words = shlex.split(command, comments=True)
+            assert program == "cnpgen"
+            assert main(words) in ({0, 1} if otherwise else {0}), line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_blocks_of_a_page_run_in_order(page: Path, needed: Path, tmp_path: Path) -> None:
+    for marks, language, text in shown(page):
+        if "needs" in marks and not (tmp_path / marks["needs"]).exists():
+            shutil.copytree(needed, tmp_path / marks["needs"])
         if "file" in marks:
             path = tmp_path / marks["file"]
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,7 +225,7 @@ def test_what_a_page_links_to_is_there(page: Path) -> None:
 
 
 def test_every_page_can_be_reached_from_the_readme() -> None:
-    seen, waiting = set[Path](), [ROOT / "README.md"]
+    seen, waiting = set[Path](), [README]
     while waiting:
         page = waiting.pop()
         if page in seen or page.suffix != ".md":

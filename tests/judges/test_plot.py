@@ -4,11 +4,10 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.judges.plans.plot import plot_plan
@@ -22,6 +21,9 @@ from tests.examples.obstacles import KINDS, draw_obstacle
 from tests.examples.plans import Plan, bent, course, load
 from tests.examples.shaped_robot import write_problem
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 again = pytest.mark.extended  # the same claim, with the other of two plans
 
 
@@ -30,14 +32,16 @@ def draw(plan: Plan, path: Path, index: int = 0) -> None:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
+def drawn(monkeypatch: pytest.MonkeyPatch) -> "Iterator[list[Figure]]":
     """The figures that would have been saved."""
+    from matplotlib.figure import Figure
+
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.append(self))
     return figures
 
 
-def axes_of(figure: Figure) -> dict[str, Any]:
+def axes_of(figure: "Figure") -> dict[str, Any]:
     """Axes by the label of their y axis or their title."""
     axes = [axis for part in figure.subfigs for axis in part.axes]
     return {axis.get_title() or axis.get_ylabel(): axis for axis in axes}
@@ -48,7 +52,7 @@ def shadow(patch: Any) -> Any:
     return patch.get_path().get_extents(patch.get_patch_transform())
 
 
-def test_jerks_are_drawn_where_they_are_limited(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_jerks_are_drawn_where_they_are_limited(tmp_path: Path, drawn: "list[Figure]") -> None:
     plan = jerky_plan("hit")
     draw(plan, tmp_path / "a.png")
     draw(load("hit"), tmp_path / "b.png")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2_contingency, chisquare, ks_2samp, kstest
+import scipy  # which imports its statistics when they are asked for: that takes a second
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.load import load_pipeline
@@ -21,12 +21,12 @@ PROBABLE = 1e-4  # p-value below which a sample is not believed to follow its la
 
 def is_uniform(values: np.ndarray, low: float, high: float) -> bool:
     inside = low <= values.min() and values.max() <= high
-    return inside and kstest(values, "uniform", (low, high - low)).pvalue > PROBABLE
+    return inside and scipy.stats.kstest(values, "uniform", (low, high - low)).pvalue > PROBABLE
 
 
 def is_fraction(hits: np.ndarray, fraction: float) -> bool:
     counts = np.array([np.sum(hits), np.sum(~hits)])
-    return chisquare(counts, len(hits) * np.array([fraction, 1 - fraction])).pvalue > PROBABLE
+    return scipy.stats.chisquare(counts, len(hits) * np.array([fraction, 1 - fraction])).pvalue > PROBABLE
 
 
 def stage_of(prepared: PreparedPipeline, kind: str):
@@ -58,14 +58,14 @@ def test_positions_follow_the_law_of_plain_rejection_sampling(drawn):
     expected = plain_rejection(stage, DRAWS)
     if stage.min_distance:
         kept = np.array([len(draws.alive), expected["start"].shape[1]])
-        assert chi2_contingency([kept, DRAWS - kept]).pvalue > PROBABLE
+        assert scipy.stats.chi2_contingency([kept, DRAWS - kept]).pvalue > PROBABLE
     for end in ("start", "goal"):
         for axis in range(3):
-            assert ks_2samp(draws[f"{end}_xyz"][axis], expected[end][axis]).pvalue > PROBABLE
+            assert scipy.stats.ks_2samp(draws[f"{end}_xyz"][axis], expected[end][axis]).pvalue > PROBABLE
     distances = [np.hypot(*(ends[1] - ends[0])[:2]) for ends in (
         (draws["start_xyz"], draws["goal_xyz"]), (expected["start"], expected["goal"]),
     )]  # fmt: skip
-    assert ks_2samp(*distances).pvalue > PROBABLE
+    assert scipy.stats.ks_2samp(*distances).pvalue > PROBABLE
 
 
 def test_positions_before_the_rejection_are_uniform_in_their_boxes(drawn):

@@ -9,7 +9,7 @@ from cnpgen.planner.landing import make_landing
 from cnpgen.planner.preparation import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.conftest import columns_of, needs_compiler, some
-from tests.examples.models import accelerated, boundary_of_columns, landing_of, meaning_of, surroundings_of
+from tests.examples.models import accelerated, boundary_of_columns, landing_of, meaning_of, quickest, surroundings_of
 from tests.planner.test_parts import heights, worst_tilt
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
@@ -20,7 +20,7 @@ FIXED = [("airhockey", 2), ("airhockey", 3), ("heavy-object", 2)]  # control poi
 
 def nearby(tiny, name: str, count: int = 8, fixed: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Paths near the manifold, as a network gives them, and heights of obstacles."""
-    given, boundary = surroundings_of(name), drawn(tiny, name, count, fixed)
+    given, boundary = quickest(name, fixed), drawn(tiny, name, count, fixed)
     kit = make_kit(given, meaning_of(1, 0), slow_down=False, fixed_at_goal=fixed)
     tasks, spec = kit.prepare(boundary), given.problem.trajectory
     rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
@@ -100,7 +100,7 @@ def test_a_plan_that_is_not_finite_does_not_touch_the_others(tiny):
 
 @pytest.mark.parametrize(("name", "fixed"), some(FIXED, 2, "slow"))
 def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name, fixed):
-    given, boundary = surroundings_of(name), drawn(tiny, name, 8, fixed)
+    given, boundary = quickest(name, fixed), drawn(tiny, name, 8, fixed)
     kit = make_kit(given, meaning_of(1, 1), slow_down=False, fixed_at_goal=fixed)
     tasks, random = kit.prepare(boundary), np.random.default_rng(2)
     phi, log_rate = random.uniform(-1, 1, (8, (12 - fixed) * given.robot.n)), random.normal(0, 0.3, (8, 20))
@@ -114,7 +114,7 @@ def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name, fixe
 
 @pytest.mark.parametrize(("name", "fixed"), FIXED[1:])
 def test_the_bent_line_is_the_papers_line_bent(tiny, name, fixed):
-    given, boundary = surroundings_of(name), drawn(tiny, name, 5, fixed)
+    given, boundary = quickest(name, fixed), drawn(tiny, name, 5, fixed)
     kit = make_kit(given, meaning_of(1, 0), slow_down=False, fixed_at_goal=fixed)
     tasks = kit.prepare(boundary)
     rate, spec = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1), given.problem.trajectory

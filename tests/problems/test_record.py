@@ -93,7 +93,7 @@ def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
 
 @pytest.mark.parametrize("given", some([RECORD, HEAVY, "heavy-object"], 1, "slow"))
 def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Problem) -> None:
-    loss, omega = PlanLoss(given), Omega(given, landing_steps=0)  # whose kernels would be long to compile
+    loss, omega = PlanLoss(given, backend="numpy"), Omega(given, landing_steps=0, backend="numpy")  # for two plans
     q = np.tile(HEAVY.robot.base, (2, 1))
     zero = np.zeros_like(q)
     tasks = omega.tasks(Boundary(q, zero, zero, q + 0.1, zero))
@@ -103,7 +103,7 @@ def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Prob
     np.testing.assert_array_equal(tops, omega.tops(tasks))
     arrays = plans.path_control_points, plans.rate_control_points
     found = loss(*arrays, weights=loss.weights0, tops=tops)
-    expected = PlanLoss(HEAVY)(*arrays, weights=loss.weights0, tops=tops)
+    expected = PlanLoss(HEAVY, backend="numpy")(*arrays, weights=loss.weights0, tops=tops)
     np.testing.assert_array_equal(found.total, expected.total)
     again = make_plans(given, plans.boundary, path_control_points=arrays[0], rate_control_points=arrays[1])
     assert again.problem.comparable_sha256 == plans.problem.comparable_sha256 == RECORD.comparable_sha256

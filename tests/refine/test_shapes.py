@@ -45,6 +45,7 @@ def test_valid_plans_touch_nothing(tmp_path, obstacles):
         assert min(min(meshes.distances(q)) for q in path[:: max(len(path) // 100, 1)]) > -allowed - 1e-6
 
 
+@pytest.mark.slow
 def test_plans_may_have_to_stop_without_acceleration(tmp_path):
     write_problem(tmp_path)
     write_pipeline(tmp_path, stop='acceleration = "zero"')

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
@@ -176,6 +175,8 @@ def test_nothing_to_draw_is_said(unfinished, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("draws", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
 def test_cells_of_a_map_hold_enough_draws_to_say_something(draws, cells, hits, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
     random = np.random.default_rng(0)
     drawn = np.bincount(random.integers(0, 24 * 24, draws), minlength=24 * 24).reshape(24, 24)
     accepted = random.binomial(drawn, 0.5)
