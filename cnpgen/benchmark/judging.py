@@ -54,7 +54,7 @@ def _judge(problem: Plans, samples: Samples, answer: Trajectory) -> Verdict:
     world = _world(problem.problem)
     world.set_path(states.q, states.dq, states.ddq, tops, states.jerk)
     start_tip = world.tip_position[:, 0]
-    margins = boundary_margins(states, problem.boundary, samples, robot.joint_names)
+    margins = boundary_margins(states, problem.boundary, samples, robot)
     for constraint in meaning.constraint:
         margins += [each.margin(meaning, samples) for each in measure(constraint, world, samples.s, start_tip)]
     unknown = np.full_like(states.q, np.nan)

@@ -17,12 +17,13 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
+from cnpgen.schema.units import unit_of
 
 WIDTH = 100
 
 Recipe = Problem | Pipeline | DatasetRecipe
 
-LIMITS = {
+LIMITS = {  # with their units at joints that turn
     "position_lower": "rad",
     "position_upper": "rad",
     "velocity_limit": "rad/s",
@@ -130,17 +131,26 @@ def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
     """List what limits every joint; its jerk where the problem has something to say about jerks."""
     ends = zip(robot.position_lower, robot.position_upper, strict=True)
     columns = [
-        ("joint", "", robot.joint_names),
-        ("position", "[rad]", [f"{low:.4g} to {high:.4g}" for low, high in ends]),
-        ("velocity", "[rad/s]", [f"{x:.4g}" for x in robot.velocity_limit]),
-        ("acceleration", "[rad/s^2]", [f"{x:.4g}" for x in robot.acceleration_limit]),
-        ("jerk", "[rad/s^3]", [f"{x:.6g}" for x in robot.jerk_limit]),
-        ("torque", "[N m]", [f"{x:.4g}" for x in robot.torque_limit]),
-        ("base", "[rad]", [f"{x:.4g}" for x in robot.base]),
+        ("position", "rad", [f"{low:.4g} to {high:.4g}" for low, high in ends]),
+        ("velocity", "rad/s", [f"{x:.4g}" for x in robot.velocity_limit]),
+        ("acceleration", "rad/s^2", [f"{x:.4g}" for x in robot.acceleration_limit]),
+        ("jerk", "rad/s^3", [f"{x:.6g}" for x in robot.jerk_limit]),
+        ("torque", "N m", [f"{x:.4g}" for x in robot.torque_limit]),
+        ("base", "rad", [f"{x:.4g}" for x in robot.base]),
     ]
     spoken_of = problem.uses_jerk or problem.limits.jerk is not None
-    shown = [(name, unit, *cells) for name, unit, cells in columns if spoken_of or name != "jerk"]
-    return list(zip(*shown, strict=True))
+    shown = [
+        (name, *with_units(robot.units(unit), cells)) for name, unit, cells in columns if spoken_of or name != "jerk"
+    ]
+    return list(zip(("joint", "", *robot.joint_names), *shown, strict=True))
+
+
+def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
+    """Return a column of a table: the unit, then a cell per joint; cells have theirs where joints turn and slide."""
+    each = [unit_of(units, index) for index in range(len(cells))]
+    if len(set(each)) == 1:
+        return f"[{each[0]}]", *cells
+    return "", *(f"{cell} {unit}" for cell, unit in zip(cells, each, strict=True))
 
 
 def title_lines(title: str) -> list[str]:
@@ -202,7 +212,9 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     content["joints"] = list(robot.joint_names)
     if robot.shape:
         content["shape"] = shape_to_dict(robot.shape)
-    content["limits"] = {name: {"unit": unit, "values": list(getattr(robot, name))} for name, unit in LIMITS.items()}
+    content["limits"] = {
+        name: {"unit": robot.units(unit), "values": list(getattr(robot, name))} for name, unit in LIMITS.items()
+    }
     return content
 
 

@@ -22,7 +22,10 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "--tip", metavar="FRAME", help="link or joint that the task is about; default the only link that carries none"
     )
-    text = "a folder in which package:// in the URDF is looked up; can be given more than once"
+    text = "a folder in which package:// in the URDF is looked up; can be given more than once. By default those of"
+    text += (
+        " ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those above the URDF; what is used of the former is written down"
+    )
     option("--packages", metavar="DIR", type=Path, action="append", default=[], help=text)
     option("--force", action="store_true", help="write over files that are there")
 
@@ -32,13 +35,15 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.cli.init.arm import read_arm
     from cnpgen.cli.init.recipes import dataset_of
     from cnpgen.cli.init.write import FILES, texts_of
+    from cnpgen.robots.shape.files import packages_of_environment
     from cnpgen.store.files.atomic import write_file
 
     folder = _folder(arguments.name)
     there = [str(folder / name) for name in FILES if (folder / name).exists()]
     _refuse(there if not arguments.force else [])
     arm = read_arm(arguments.urdf, arguments.tip)
-    recipe, arm, share = dataset_of(arm, folder.name, folder, tuple(arguments.packages))
+    packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
+    recipe, arm, share = dataset_of(arm, folder.name, folder, packages)
     for name, text in texts_of(recipe, arm, share, folder).items():
         folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / name, text)

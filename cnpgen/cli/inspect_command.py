@@ -102,11 +102,11 @@ def _yield_lines(fates: "Fates") -> list[str]:
 
 
 def _field_rows(field: "Field", found: "FieldStatistics | None") -> list[tuple[str, ...]]:
-    """Return a row per column of a field; the field's name and unit are on the first one."""
+    """Return a row per column of a field; its name is on the first one, its unit where it is not that of the last."""
     columns = field.names or ("",) * max(field.width, 1)
-    rows = []
-    for index, column in enumerate(columns):
-        first = (field.name, column, field.unit) if index == 0 else ("", column, "")
+    rows, before = [], ""
+    for index, (column, unit) in enumerate(zip(columns, field.units, strict=True)):
+        first, before = ("" if index else field.name, column, "" if unit == before else unit), unit
         numbers = (found.minimum, found.mean, found.maximum) if found else ()
         rows.append((*first, *(f"{values[index]:.5g}" for values in numbers), *([] if found else ["-"] * 3)))
     return rows

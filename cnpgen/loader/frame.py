@@ -37,7 +37,7 @@ def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, lib
     }
     frame = import_module(name).DataFrame(columns)
     if name == "pandas":
-        frame.attrs["units"] = {column: field.unit for field in fields for column in field.columns}
+        frame.attrs["units"] = dict(pair for field in fields for pair in zip(field.columns, field.units, strict=True))
     return frame
 
 

@@ -49,8 +49,9 @@ class CertifiedPlan(Stage):
         path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
         shape = f"({points}, {len(joints)})"
         text = f"control points of the path p(s) of a valid plan, reshape to {shape}"
+        units = context.robot.units("rad")
         return (
-            Field("path_control_points", "rad", text, points * len(joints), path_names, role="target"),
+            Field("path_control_points", units, text, points * len(joints), path_names, role="target"),
             Field(
                 "rate_control_points",
                 "1/s",

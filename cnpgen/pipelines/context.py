@@ -44,7 +44,14 @@ class Context:
         raise RecipeError([f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"])
 
     def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:
-        """Describe a field with one column per planned joint, bounded by the planning limits of its unit."""
+        """Describe a field with one column per planned joint, bounded by the planning limits of its unit.
+
+        Args:
+            name: Its name.
+            unit: Its unit at joints that turn: "rad", "rad/s" or "rad/s^2".
+            long_name: What it is, in a few words.
+            role: As of ``Field``.
+        """
         robot = self.robot
         bounds = {
             "rad": (robot.position_lower, robot.position_upper),
@@ -52,7 +59,9 @@ class Context:
             "rad/s^2": (-robot.acceleration_limit, robot.acceleration_limit),
         }[unit]
         low, high = (tuple(float(x) for x in bound) for bound in bounds)
-        return Field(name, unit, long_name, robot.n, robot.joint_names, role, valid_min=low, valid_max=high)
+        return Field(
+            name, robot.units(unit), long_name, robot.n, robot.joint_names, role, valid_min=low, valid_max=high
+        )
 
 
 def load_context(problem: Problem, backend: Backend, cache_folder: Path, dtype: str = "float64") -> Context:

@@ -146,11 +146,12 @@ def _write_each(out: Path, plans: Plans | JoinedPlans, rate: float, kept: list[i
     """Write one file per plan."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder")
-    encode, ending = (csv_table, "csv") if to == "csv" else (joint_trajectory, "json")
-    files = []
+    joints, files = plans.problem.joint_names, []
     for index, sampled in _sampled(plans, rate, kept):
-        files.append(out / f"plan_{index:05d}.{ending}")
-        write_file(files[-1], encode(sampled, plans.problem.joint_names))
+        table = to == "csv"
+        files.append(out / f"plan_{index:05d}.{'csv' if table else 'json'}")
+        text = csv_table(sampled, joints, plans.problem.sliding_joints) if table else joint_trajectory(sampled, joints)
+        write_file(files[-1], text)
     return tuple(files)
 
 

@@ -1,7 +1,6 @@
 """What a plan file holds: names, units and meanings of its datasets (docs/plan-format.md)."""
 
-from dataclasses import replace
-
+from cnpgen.schema.units import units_of_joints
 from cnpgen.store.field import Field
 
 FORMAT = "cnpgen-plans"
@@ -16,10 +15,9 @@ INTEGERS = ("sample_id", "status")
 NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
-_UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "xyz": "m"}
+UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # of joints that turn
 _MEANINGS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}
 _OTHERS = (
-    Field("path_control_points", "rad", "control points of the path p(s)"),
     Field("rate_control_points", "1/s", "control points of the rate r(s) = ds/dt"),
     Field("duration", "s", "integral of 1 / r(s)", role="diagnostic"),
     Field("sample_id", "1", "index of the sample in its split", role="diagnostic"),
@@ -32,13 +30,20 @@ _OTHERS = (
 )
 
 
-def plan_fields(joints: tuple[str, ...]) -> dict[str, Field]:
-    """Describe the datasets that have a fixed meaning."""
+def plan_fields(joints: tuple[str, ...], sliding: tuple[bool, ...]) -> dict[str, Field]:
+    """Describe the datasets that have a fixed meaning.
+
+    Args:
+        joints: Names of the planned joints.
+        sliding: Of each whether it slides.
+    """
     fields = {item.name: item for item in _OTHERS}
     for end, goal in (("start", "the start"), ("goal", "the goal")):
-        for what, unit in _UNITS.items():
+        for what, meaning in _MEANINGS.items():
             axes, frame = (("x", "y", "z"), "world") if what == "xyz" else (joints, "")
+            unit = "m" if what == "xyz" else units_of_joints(UNITS[what], sliding)
             name = f"{end}_{what}"
-            fields[name] = Field(name, unit, f"{_MEANINGS[what]} at {goal}", len(axes), axes, frame=frame)
-    fields["path_control_points"] = replace(fields["path_control_points"], names=joints)
+            fields[name] = Field(name, unit, f"{meaning} at {goal}", len(axes), axes, frame=frame)
+    name, unit = "path_control_points", units_of_joints(UNITS["q"], sliding)
+    fields[name] = Field(name, unit, "control points of the path p(s)", names=joints)
     return fields

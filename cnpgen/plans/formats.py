@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.plans.format import UNITS
+from cnpgen.schema.units import unit_of, units_of_joints
 from cnpgen.store.files.atomic import committing
 from cnpgen.trajectory.joined import JoinedMotion
 from cnpgen.trajectory.motion import Motion
 
 Array = NDArray[np.float64]
 
-UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}
 LEAST_STEP = 0.01  # the last step may be this part of a step; what would be shorter is joined to the step before
 
 # YAML 1.1, which ROS's tools read, takes 1e-05 for a text: a number needs a point before its exponent.
@@ -55,11 +56,19 @@ def sample_plan(motion: Motion | JoinedMotion, rate: float) -> Sampled:
     return Sampled(t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
 
 
-def csv_table(sampled: Sampled, joints: tuple[str, ...]) -> str:
-    """Write a plan as a table of CSV; every number reads back as the same float64."""
+def csv_table(sampled: Sampled, joints: tuple[str, ...], sliding: tuple[bool, ...]) -> str:
+    """Write a plan as a table of CSV; every number reads back as the same float64.
+
+    Args:
+        sampled: The plan.
+        joints: Names of the joints.
+        sliding: Of each whether it slides.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["t [s]", *(f"{name} {joint} [{unit}]" for name, unit in UNITS.items() for joint in joints)])
+    units = {name: units_of_joints(unit, sliding) for name, unit in UNITS.items()}
+    heads = [f"{name} {joint} [{unit_of(units[name], i)}]" for name in UNITS for i, joint in enumerate(joints)]
+    writer.writerow(["t [s]", *heads])
     columns = [getattr(sampled, name) for name in UNITS]
     writer.writerows(np.column_stack([sampled.t, *columns]).tolist())
     return text.getvalue()

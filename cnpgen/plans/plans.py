@@ -266,7 +266,10 @@ def _rows(plans: Plans) -> int:
     fields: list[NDArray[Any]] = [part for part in _parts(plans.boundary) if part is not None]
     fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()
-    return Counter(len(field) if field.ndim else 0 for field in fields).most_common(1)[0][0]
+    lengths = [len(field) if field.ndim else 0 for field in fields]
+    if lengths.count(lengths[0]) == len(lengths):  # a tenth of the time of counting
+        return lengths[0]
+    return Counter(lengths).most_common(1)[0][0]
 
 
 def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:

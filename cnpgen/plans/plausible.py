@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
 FAR = 2.0  # from the middle of a joint's range, in halves of it: a whole half range beyond its limit
@@ -27,10 +28,12 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
         far = np.abs(q - (low + high) / 2) > FAR * (high - low) / 2
         if far.any():
             plan, joint = np.argwhere(far)[0]
-            value, limits = f"{q[plan, joint]:.6g} rad", f"[{low[joint]:.3g}, {high[joint]:.3g}]"
+            unit = unit_of(robot.units("rad"), int(joint))
+            other = "millimetres" if unit == "m" else "degrees"
+            value, limits = f"{q[plan, joint]:.6g} {unit}", f"[{low[joint]:.3g}, {high[joint]:.3g}]"
             warnings.warn(
                 f"{name} of plan {plan}: {robot.joint_names[joint]} = {value} is far outside of its limits, {limits}:"
-                " joint positions must be in rad, are these degrees, or normalised?",
+                f" joint positions must be in {unit}, are these {other}, or normalised?",
                 UserWarning,
                 stacklevel=_users_level(),
             )

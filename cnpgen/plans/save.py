@@ -37,7 +37,7 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     check_plans_type(plans)
     check_replaceable(Path(path))
     buffer = io.BytesIO()
-    fields = plan_fields(plans.problem.joint_names)
+    fields = plan_fields(plans.problem.joint_names, plans.problem.sliding_joints)
     with h5py.File(create_hdf5(buffer, userblock=BLOCK)) as file:
         for name, values in _datasets(plans).items():
             dataset = file.create_dataset(name, data=values, track_times=False)

@@ -72,6 +72,13 @@ class ProblemRecord(StoredProblem):
         """The n planned joints."""
         return tuple(self.content["robot"]["joints"])
 
+    @cached_property
+    def sliding_joints(self) -> tuple[bool, ...]:
+        """Of every planned joint whether it slides."""
+        joints = urdf_tree(self.urdf).iter("joint")
+        sliding = {joint.get("name") for joint in joints if joint.get("type") == "prismatic"}
+        return tuple(name in sliding for name in self.joint_names)
+
     @property
     def held_joints(self) -> dict[str, float]:
         """Joints of the URDF that move and are not planned -> where they stay [rad or m]: at zero."""
@@ -79,7 +86,7 @@ class ProblemRecord(StoredProblem):
         moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
         return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
 
-    @property
+    @cached_property
     def trajectory(self) -> TrajectorySpec:
         """Parameterisation that the problem suggests.
 

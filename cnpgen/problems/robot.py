@@ -17,6 +17,7 @@ from cnpgen.robots.robot import Robot, reduced_model
 from cnpgen.robots.shape.piece import turned
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.schema.keys import PerJoint
+from cnpgen.schema.units import unit_of
 
 Array = NDArray[np.float64]
 
@@ -142,8 +143,9 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
         return
     worst = int(np.argmax(np.maximum(low - base, base - high)))
     if not low[worst] <= base[worst] <= high[worst]:
+        unit = unit_of(robot.units("rad"), worst)
         yield (
-            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} rad is outside its planning"
+            f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} {unit} is outside its planning"
             f" limits [{low[worst]:g}, {high[worst]:g}]"
         )
     for table in (each for each in problem.constraint if isinstance(each, Table)):

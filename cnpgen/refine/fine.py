@@ -11,6 +11,7 @@ from cnpgen.refine.solver.bounds import BoundsTemplate, Tightening
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, of_last
 from cnpgen.refine.task import Task
+from cnpgen.robots.solid import count_numbers
 
 if TYPE_CHECKING:
     from cnpgen.world.state import World
@@ -59,6 +60,9 @@ class FineCheck:
         conditions = self._bounds.conditions
         self.equalities = {each.name for each in conditions if each.is_equality}
         self._equal = np.repeat([each.is_equality for each in conditions], [len(each.g) for each in conditions])
+        limits = np.repeat([each.exactness == "limit" for each in conditions], [len(each.g) for each in conditions])
+        self._speeds = np.flatnonzero((self._bounds.needs == 1) & ~limits)  # what is bounded besides joint velocities
+        self._powers = _powers_of_rate(problem, world, stage)[self._speeds] if len(self._speeds) else np.empty(0)
 
     def transcription(self, task: Task) -> Transcription:
         """Return the motion on the fine grid; for one task it is asked for many times."""
@@ -77,6 +81,7 @@ class FineCheck:
         high = ratio > 1
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.where(high, g / np.where(g > bounds.upper, bounds.upper, bounds.lower), 0.0).max(axis=0)
+            size[self._speeds] **= 1 / self._powers
         speed, strength, jerk = (size[self._bounds.needs == needs].max(initial=1.0) for needs in (1, 2, 3))
         slower = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
         return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), slower)
@@ -86,6 +91,18 @@ class FineCheck:
         bounds, middle = self._bounds.of(task.start_xyz), POINTS // 2
         allowed = np.where(self._bounds.capsules, 0.0, self._bounds.allowed)
         return self._bounds.capsules, bounds.lower[middle] - allowed, bounds.upper[middle] + allowed
+
+    def too_fast(self, task: Task, x: Array) -> float:
+        """Return by which factor a motion is too fast for bounds of speeds other than those of joints; 1 if it is not.
+
+        Starts meet the velocity limits of joints; of the tip, or of whatever a plug-in bounds, they know nothing.
+        """
+        if not len(self._speeds):
+            return 1.0
+        g, upper = self.transcription(task).measured(x)[1], self._bounds.of(task.start_xyz).upper
+        with np.errstate(divide="ignore", invalid="ignore"):
+            over = np.nanmax(g[:, self._speeds] / upper[:, self._speeds], axis=0)
+        return max(float(np.max(np.maximum(over, 0.0) ** (1 / self._powers))), 1.0)
 
     def refutes_ends(self, task: Task) -> bool:
         """Whether the boundary conditions alone exceed a bound, by more than the tolerance: no motion will do."""
@@ -122,3 +139,14 @@ class FineCheck:
             x[motion.split :] -= np.log(excess.slower * (1 + 1e-9))
             cost, excess = self.measure(task, x)
         return x, cost, excess
+
+
+def _powers_of_rate(problem: Problem, world: "World", stage: ResidualKernels) -> Array:
+    """Return with which power of the rate every residual grows, at least 1, where it depends on velocities: (m,)."""
+    n, orders, random = world.robot.n, problem.path_orders, np.random.default_rng(0)
+    w = np.zeros((orders * n + orders - 1, 2))
+    w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
+    w[orders * n] = 1.0, 2.0
+    (g,) = stage.values(w, np.zeros((count_numbers(problem.obstacle), 2)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.maximum(np.nan_to_num(np.log2(g[:, 1] / g[:, 0]).round(), nan=1.0, posinf=1.0), 1.0)

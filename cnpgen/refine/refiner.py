@@ -1,6 +1,6 @@
 """Refining one plan: a cheap first pass, a polish on a finer grid where a check fails, other starts only then."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -38,6 +38,7 @@ WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
 TOUCHING = 0.02  # m: as deep as links may be in a plan that is gone on from
 SEEDS = 3  # ways round obstacles that are tried
+ROOM = 1.6  # times slower than bounds of speeds ask for: a start that is within them moves on more easily
 ROUNDS = 4  # from a motion that was slowed down; most need one
 FROM_NOTHING, CROWDED = 0.1, 0.05  # shares of the tolerance from nothing, where small steps still lead far
 
@@ -167,8 +168,27 @@ class Refiner:
             yield self._slowed_only(task, given)
             return
         repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
-        x = given if repaired is None else repaired.x
-        first = self._first(task, x)
+        best = yield from self._passes(task, given, repaired)
+        if self.check.refutes_ends(task):
+            return
+        for other in self._from_others(task, given if repaired is None else repaired.x, best):
+            yield other
+            best = other if other.is_better(best) else best
+        if given is not None:  # it may have led all of these astray
+            for attempt in self._passes(task, None, None):
+                yield replace(attempt, outcome=Outcome.RESTARTED)
+        if task.until == np.inf and keeps_clear(self.problem, self.robot):
+            yield from self._around(task, best)
+
+    def _passes(self, task: Task, given: Array | None, repaired: Attempt | None) -> Generator[Attempt, None, Attempt]:
+        """Yield the plans of the three passes, from a given one or from nothing; return the best one.
+
+        Args:
+            task: What to plan.
+            given: Variables of the given plan.
+            repaired: The given plan with exact ends, slowed down, where that may be: where passes begin.
+        """
+        first = self._first(task, given if repaired is None else repaired.x)
         outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
         if first.violation <= self.settings.violation_tolerance and not task.at_rest:
             cost = first.cost - self.check.transcription(task).gauge(first.x)
@@ -184,13 +204,7 @@ class Refiner:
         best = polished if polished.is_better(best) else best
         strict = self._attempt(task, self.passes.strict, best.x, Outcome.POLISHED)
         yield strict
-        if not self.check.refutes_ends(task):
-            best = strict if strict.is_better(best) else best
-            for other in self._from_others(task, x, best):
-                yield other
-                best = other if other.is_better(best) else best
-            if task.until == np.inf and keeps_clear(self.problem, self.robot):
-                yield from self._around(task, best)
+        return strict if strict.is_better(best) else best
 
     def _iterated_on(self, task: Task, best: Attempt) -> Attempt:
         """Go on from a motion that had to be slowed down, for as long as that gains.
@@ -256,7 +270,7 @@ class Refiner:
             way = find_way(ends.start_q[0], ends.goal_q[0], self.robot, space.free, seed=seed)
             if way is None:
                 return
-            x = _variables(along_way(way, ends, self.robot.velocity_limit, self.spec))
+            x = self._slow_enough(task, along_way(way, ends, self.robot.velocity_limit, self.spec))
             yield self._measured(task, x, Outcome.RESTARTED, at_any_cost=True)
 
     def minimise(self, task: Task, which: Pass, x: Array, hulls: Hulls | None = None) -> Result:
@@ -280,8 +294,8 @@ class Refiner:
         return self._bounds[which].of(task.start_xyz, ends=ends)
 
     def straight(self, task: Task) -> Array:
-        """Return the variables of the straight line at a constant rate."""
-        return _variables(starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
+        """Return the variables of the straight line, where the first pass begins."""
+        return self._slow_enough(task, starts.gentle(task.boundary, self.robot.velocity_limit, self.spec))
 
     def _first(self, task: Task, x: Array | None) -> Result:
         """Run the first pass from variables, or from a straight line where there are none, or far off."""
@@ -317,9 +331,15 @@ class Refiner:
             starts.smooth(boundary, limit, spec),
             starts.through(boundary, limit, spec, middle=self._middle),
         ]
-        return list(map(_variables, found))
+        return [self._slow_enough(task, start) for start in found]
 
+    def _slow_enough(self, task: Task, start: tuple[Array, Array]) -> Array:
+        """Return the variables of a start, slower where other speeds than those of joints are bounded.
 
-def _variables(start: tuple[Array, Array]) -> Array:
-    interior, rate = start
-    return np.concatenate([interior.ravel(), np.log(rate)])
+        From a motion that is many times too fast the iteration ends far from what is feasible.
+        """
+        interior, rate = start
+        x = np.concatenate([interior.ravel(), np.log(rate)])
+        if (factor := self.check.too_fast(task, x)) > 1:
+            x[interior.size :] -= np.log(ROOM * factor)
+        return x

@@ -15,6 +15,7 @@ from cnpgen.robots.chain import Chain, frame_of, tell_links_apart
 from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.units import units_of_joints
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -64,6 +65,15 @@ class Robot:
     def n(self) -> int:
         """Number of planned joints."""
         return len(self.joint_names)
+
+    @cached_property
+    def sliding(self) -> tuple[bool, ...]:
+        """Of every joint whether it slides: in m, where one that turns is in rad."""
+        return tuple(joint.prismatic for joint in self.chain.joints)
+
+    def units(self, turning: str) -> str:
+        """Name the units of a quantity of the joints by its unit at those that turn: see ``units_of_joints``."""
+        return units_of_joints(turning, self.sliding)
 
     @cached_property
     def skeleton(self) -> tuple[tuple[int, int], ...]:

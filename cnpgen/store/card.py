@@ -173,7 +173,7 @@ def _range_rows(field: Field, found: FieldStatistics) -> list[tuple[str, ...]]:
         name = f"{field.name}.{field.names[column] if field.names else column}" if field.width else field.name
         limits = [limit[column] for limit in (field.valid_min, field.valid_max) if limit]
         text = f"{limits[0]:.6g} ... {limits[1]:.6g}" if len(limits) == 2 else "-"
-        rows.append((f"`{name}`", field.unit, *(f"{value:.6g}" for value in values), text))
+        rows.append((f"`{name}`", field.units[column], *(f"{value:.6g}" for value in values), text))
     return rows
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from cnpgen.schema.units import unit_of
+
 
 @dataclass(frozen=True)
 class Field:
@@ -9,7 +11,8 @@ class Field:
 
     Attributes:
         name: HDF5 dataset name at the root of the shard.
-        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1".
+        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1"; or, where some joints slide and others
+            turn, one per joint, separated by commas.
         long_name: What it is, in a few words.
         width: Number of columns; 0 for a scalar per row.
         names: Names of the columns (joints, axes), empty for scalars.
@@ -36,6 +39,11 @@ class Field:
             limits = getattr(self, name)
             if limits is not None:
                 object.__setattr__(self, name, tuple(map(float, limits)))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of every column."""
+        return tuple(unit_of(self.unit, column) for column in range(max(self.width, 1)))
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -50,7 +50,8 @@ def _check_range(field: Field, values: NDArray[Any], task: ShardTask, dtype: str
             beyond = sign * (np.array(bound) - values.reshape(len(values), -1))
             out = np.flatnonzero((beyond > slack(np.array(bound), dtype)).any(axis=1))
             if len(out):
-                text = f"{field.name} is beyond its {name} by up to {beyond.max():.3g} {field.unit}"
+                unit = field.units[int(np.argmax(beyond.max(axis=0)))]
+                text = f"{field.name} is beyond its {name} by up to {beyond.max():.3g} {unit}"
                 yield f"{text}: {_rows(out, task)}"
 
 

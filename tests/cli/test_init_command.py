@@ -164,6 +164,9 @@ def test_an_arm_of_sliding_joints_has_boxes_within_its_reach(tmp_path):
     assert main(["init", str(tmp_path / "gantry"), "--urdf", str(urdf)]) == 0
     goal = load_dataset_recipe(tmp_path / "gantry" / "dataset.toml").pipeline.stage[0].goal
     assert goal[1].low > 0
+    text = (tmp_path / "gantry" / "problem.toml").read_text(encoding="utf-8")
+    units = next(line for line in text.splitlines() if "[m/s]" in line)
+    assert re.findall(r"\[.*?\]", units) == ["[m]", "[m/s]", "[N]"]
 
 
 def test_the_urdf_and_packages_are_named_from_the_recipes(tmp_path, monkeypatch):
@@ -174,6 +177,32 @@ def test_the_urdf_and_packages_are_named_from_the_recipes(tmp_path, monkeypatch)
     assert main(["init", "recipes/arm", "--urdf", "robots/arm.urdf", "--packages", "meshes"]) == 0
     robot = load_problem(tmp_path / "recipes" / "arm" / "problem.toml").robot
     assert (robot.urdf, robot.packages) == ("../../robots/arm.urdf", ("../../meshes",))
+
+
+@pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"])
+def test_packages_that_the_environment_names_are_written_down(tmp_path, monkeypatch, variable):
+    urdf = write_crane(tmp_path / "share")
+    (tmp_path / "robots").mkdir()
+    moved = tmp_path / "robots" / "crane.urdf"
+    moved.write_text(urdf.read_text().replace('"meshes/claw', '"package://crane/meshes/claw'))
+    of_ros = variable == "ROS_PACKAGE_PATH"
+    monkeypatch.setenv(variable, str(tmp_path / "share") if of_ros else str(tmp_path))
+    assert main(["init", str(tmp_path / "my-crane"), "--urdf", str(moved), "--tip", "hand"]) == 0
+    monkeypatch.delenv(variable)
+    problem = load_problem(tmp_path / "my-crane" / "problem.toml")
+    assert problem.robot.packages == ("../share",)
+    assert load_robot(problem).shape is not None
+
+
+def test_a_package_that_is_nowhere_is_refused_with_how_to_name_it(tmp_path, capsys, monkeypatch):
+    for variable in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"):
+        monkeypatch.delenv(variable, raising=False)
+    urdf = write_crane(tmp_path / "share")
+    moved = tmp_path / "crane.urdf"
+    moved.write_text(urdf.read_text())
+    said = refused(capsys, 2, tmp_path / "my-crane", "--urdf", moved, "--tip", "hand")
+    assert "package://crane/meshes/wedge.stl" in said
+    assert "--packages of 'cnpgen init'" in said
 
 
 def refused(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> str:

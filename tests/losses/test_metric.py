@@ -170,3 +170,12 @@ def test_suggested_weights_are_positive_and_there_for_every_term(name):
     assert weights.shape == of.weights0.shape
     assert (weights > 0).all()
     assert suggested_weights(("time", "table", "keep-out-2"), [1.0, 3.0]).tolist() == [1e4, 300.0]
+
+
+def test_every_manifold_of_the_tip_begins_with_the_weight_of_the_shipped_one_that_is_like_it() -> None:
+    """The table is a plane and 'vertical' an axis; a plug-in's weight would let them go."""
+    table, plane, line, pose, vertical, axis = suggested_weights(
+        ("time", "table", "plane", "line-2", "pose", "vertical", "axis"), np.ones(6)
+    )
+    assert plane == line == pose == table
+    assert axis == vertical

@@ -50,6 +50,7 @@ class Arm:
         frames: Names of all links and joints.
         masses: Link -> its mass [kg]; 0 where it has none.
         shaped: The links that have a ``<collision>`` element.
+        meshes: The mesh files that links name.
     """
 
     urdf: Path
@@ -60,6 +61,7 @@ class Arm:
     frames: tuple[str, ...]
     masses: Mapping[str, float]
     shaped: tuple[str, ...]
+    meshes: tuple[str, ...]
 
     @property
     def has_shape(self) -> bool:
@@ -108,6 +110,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
             link.get("name", ""): _number(urdf, link.find("inertial/mass"), "value") for link in tree.findall("link")
         },
         shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
+        meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
     )
 
 

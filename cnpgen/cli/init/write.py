@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from cnpgen.cli.describe import table
+from cnpgen.cli.describe import table, with_units
 from cnpgen.cli.init.arm import SLIDE, SPEED, TURN, Arm
 from cnpgen.cli.init.recipes import STATES
 from cnpgen.cli.init.text import recipe_text
@@ -13,6 +13,7 @@ from cnpgen.cli.shape_rows import link_rows, pair_rows
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.units import units_of_joints
 
 FILES = ("problem.toml", "pipeline.toml", "dataset.toml")
 
@@ -101,7 +102,17 @@ def _about(arm: Arm, robot: Robot) -> Iterator[str]:
 
 
 def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
-    yield "joint", "type", "position [rad, m]", "velocity [/s]", "torque [N m, N]", "not in the URDF"
-    for joint in arm.planned:
-        limits = (f"{joint.lower:.4g} to {joint.upper:.4g}", f"{joint.velocity:.4g}", f"{joint.effort:.4g}")
-        yield joint.name, joint.kind, *limits, ", ".join(joint.missing)
+    sliding = tuple(joint.kind == "prismatic" for joint in arm.planned)
+    limits = {
+        ("position", "rad"): [f"{joint.lower:.4g} to {joint.upper:.4g}" for joint in arm.planned],
+        ("velocity", "rad/s"): [f"{joint.velocity:.4g}" for joint in arm.planned],
+        ("torque", "N m"): [f"{joint.effort:.4g}" for joint in arm.planned],
+    }
+    columns = [(name, *with_units(units_of_joints(unit, sliding), cells)) for (name, unit), cells in limits.items()]
+    yield from zip(
+        ("joint", "", *(joint.name for joint in arm.planned)),
+        ("type", "", *(joint.kind for joint in arm.planned)),
+        *columns,
+        ("not in the URDF", "", *(", ".join(joint.missing) for joint in arm.planned)),
+        strict=True,
+    )

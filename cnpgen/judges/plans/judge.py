@@ -177,7 +177,7 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
     world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
-    ends = boundary_margins(states, plan.boundary, samples, world.robot.joint_names)
+    ends = boundary_margins(states, plan.boundary, samples, world.robot)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
         metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
@@ -216,7 +216,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
     if not all((each.share <= 1).all() for each in found):
         return True
-    return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot.joint_names))
+    return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
 
 
 def _samples(plan: _Plan, step: float, *, sparse: bool) -> tuple[Samples, Array] | Verdict:

@@ -10,6 +10,7 @@ from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointVelocity
+from cnpgen.schema.units import unit_of
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def limit_margin(
     return Margin(
         condition.name,
         constraint.reason,
-        condition.unit,
+        unit_of(condition.unit, part),
         world.robot.joint_names[part],
         value=float(bound - excess if low else bound + excess),
         bound=float(bound),

@@ -18,16 +18,18 @@ from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.problem import Problem
+from cnpgen.schema.units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
 
-# How exactly a plan must meet its boundary conditions: unit, and what is allowed. Control points rebuilt in float64
-# meet 1e-10; ones kept in float32 miss the velocity by some 1e-5 rad/s and are told so.
+# How exactly a plan must meet its boundary conditions: unit of joints that turn, and what is allowed. Control points
+# rebuilt in float64 meet 1e-10; ones kept in float32 miss the velocity by some 1e-5 rad/s and are told so.
 BOUNDARY = {
     "q": ("boundary position", "rad", 1e-6),
     "dq": ("boundary velocity", "rad/s", 1e-6),
@@ -36,14 +38,14 @@ BOUNDARY = {
 _PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointJerk | JointTorque
 
 
-def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joints: tuple[str, ...]) -> list[Margin]:
+def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot: "Robot") -> list[Margin]:
     """Compare the ends of a motion with its boundary conditions.
 
     Args:
         states: States of one motion, both ends among them.
         boundary: Boundary conditions of one motion.
         samples: When and at which phase they are.
-        joints: Names of the joints.
+        robot: The robot.
     """
     margins = []
     for what, (name, unit, allowed) in BOUNDARY.items():
@@ -57,8 +59,8 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, joint
             Margin(
                 name,
                 Reason.BOUNDARY,
-                unit,
-                joints[int(joint)],
+                unit_of(robot.units(unit), int(joint)),
+                robot.joint_names[int(joint)],
                 value=float(found[end, joint]),
                 bound=float(want[joint]),
                 excess=float(error[end, joint]),
@@ -107,7 +109,7 @@ class Measured:
         return Margin(
             self.condition.name,
             self.constraint.reason,
-            self.condition.unit,
+            unit_of(self.condition.unit, part),
             name_part(problem, self.constraint, self.condition, part),
             value=float(g),
             bound=float(low - self.wider[k] if low - g > g - high else high + self.wider[k]),

@@ -44,7 +44,7 @@ class Condition:
 
     Attributes:
         name: What it is about, for messages and reports.
-        unit: SI unit of g.
+        unit: SI unit of g, or one per value, as ``units_of_joints`` names them.
         g: m values: SX scalars in the symbolic form, floats in the measured form.
         lower: Lower bounds, shape (m,), -inf where there is none.
         upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.

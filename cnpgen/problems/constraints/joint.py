@@ -14,6 +14,7 @@ from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.state import SymbolicState
+    from cnpgen.robots.robot import Robot
     from cnpgen.world.state import World
 
 
@@ -34,6 +35,11 @@ def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64]) -> t
     return (Condition(name, unit, g, -limit, limit, "limit"),)
 
 
+def _between(robot: "Robot", q: list[Any]) -> tuple[Condition, ...]:
+    bounds = robot.position_lower, robot.position_upper
+    return (Condition("joint position", robot.units("rad"), q, *bounds, "limit"),)
+
+
 @dataclass(frozen=True, kw_only=True)
 class JointPosition(Constraint):
     """Every joint is between its limits of position: ``lower <= q <= upper``."""
@@ -43,13 +49,11 @@ class JointPosition(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on q [rad]."""
-        robot = state.robot
-        return (Condition("joint position", "rad", state.q, robot.position_lower, robot.position_upper, "limit"),)
+        return _between(state.robot, state.q)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare q [rad] with the limits."""
-        robot = world.robot
-        return (Condition("joint position", "rad", list(world.q), robot.position_lower, robot.position_upper, "limit"),)
+        return _between(world.robot, list(world.q))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +64,11 @@ class JointVelocity(_RelativeLimit):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on dq [rad/s]."""
-        return _within("joint velocity", "rad/s", state.dq, state.robot.velocity_limit)
+        return _within("joint velocity", state.robot.units("rad/s"), state.dq, state.robot.velocity_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare dq [rad/s] with the limits."""
-        return _within("joint velocity", "rad/s", list(world.dq), world.robot.velocity_limit)
+        return _within("joint velocity", world.robot.units("rad/s"), list(world.dq), world.robot.velocity_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +79,13 @@ class JointAcceleration(_RelativeLimit):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on ddq [rad/s^2]."""
-        return _within("joint acceleration", "rad/s^2", state.ddq, state.robot.acceleration_limit)
+        return _within("joint acceleration", state.robot.units("rad/s^2"), state.ddq, state.robot.acceleration_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare ddq [rad/s^2] with the limits."""
-        return _within("joint acceleration", "rad/s^2", list(world.ddq), world.robot.acceleration_limit)
+        return _within(
+            "joint acceleration", world.robot.units("rad/s^2"), list(world.ddq), world.robot.acceleration_limit
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,13 +102,13 @@ class JointJerk(_RelativeLimit):
         """State the limits on the jerk [rad/s^3], where the state has one."""
         if state.jerk is None:
             return ()
-        return _within("joint jerk", "rad/s^3", state.jerk, state.robot.jerk_limit)
+        return _within("joint jerk", state.robot.units("rad/s^3"), state.jerk, state.robot.jerk_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare the jerk [rad/s^3] with the limits, where the state has one."""
         if world.jerk is None:
             return ()
-        return _within("joint jerk", "rad/s^3", list(world.jerk), world.robot.jerk_limit)
+        return _within("joint jerk", world.robot.units("rad/s^3"), list(world.jerk), world.robot.jerk_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +119,8 @@ class JointTorque(_RelativeLimit):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on the inverse dynamics [N m]."""
-        return _within("joint torque", "N m", state.torque, state.robot.torque_limit)
+        return _within("joint torque", state.robot.units("N m"), state.torque, state.robot.torque_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare Pinocchio's inverse dynamics [N m] with the limits."""
-        return _within("joint torque", "N m", list(world.torque), world.robot.torque_limit)
+        return _within("joint torque", world.robot.units("N m"), list(world.torque), world.robot.torque_limit)

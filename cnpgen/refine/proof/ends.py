@@ -12,6 +12,7 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable import joint_limits
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.state import World
 
@@ -65,7 +66,7 @@ def _broken(constraint: Constraint, condition: Condition, start_tip: Array, end:
     allowed = constraint.allowed(condition)
     worst = int(np.argmax(excess - allowed))
     if excess[worst] > allowed[worst] + margin * max(1.0, abs(bound[worst])):
-        unit = "" if condition.unit == "1" else f" {condition.unit}"
+        unit = "" if condition.unit == "1" else f" {unit_of(condition.unit, worst)}"
         yield (
             f"at the {end} {condition.name} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"
             f" with a tolerance of {allowed[worst]:.2g}{unit}"

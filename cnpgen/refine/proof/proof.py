@@ -17,6 +17,7 @@ from cnpgen.errors import UsageError
 from cnpgen.refine.proof.ends import end_mistakes
 from cnpgen.refine.proof.reachable import departures, joint_limits, moments
 from cnpgen.refine.proof.table_proof import find_leaving
+from cnpgen.schema.units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -120,7 +121,8 @@ def _cannot_brake(problem: "Problem", robot: "Robot", boundary: Boundary) -> Ite
             for joint in np.flatnonzero(lower > upper + MARGIN):
                 what, name = _moment(end, float(time)), robot.joint_names[joint]
                 over = float(lower[joint] - upper[joint]) - MARGIN
-                yield f"{what} {name} is {over:.2g} rad or more outside its range, however it is accelerated"
+                unit = unit_of(robot.units("rad"), int(joint))
+                yield f"{what} {name} is {over:.2g} {unit} or more outside its range, however it is accelerated"
 
 
 def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Explanation | None:

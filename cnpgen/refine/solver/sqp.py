@@ -169,6 +169,8 @@ class _Descent:
         else:
             self._try(step, model.held)
         self._violations.append(self.violation)
+        if self._is_stuck() and self._penalty < self.cost:  # breaking its limits may pay: it will not
+            self._penalty, self._violations = HEAVY * self.cost, [self.violation]
         self.ended |= self._radius < SMALLEST or self._is_stuck()
 
     def _is_stuck(self) -> bool:

@@ -1,4 +1,4 @@
-"""Where the optimiser starts from when there is no plan: straight, bent through a configuration, or smooth."""
+"""Where the optimiser starts from when there is no plan: straight, gentle, bent through a configuration, or smooth."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,7 @@ from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
+LOW, RISE = 0.3, 0.3  # share of the rate with which gentle motions begin, and share of the rates by which it is whole
 SHORTEST = 0.3  # s: first guess of the duration of motions between neighbouring configurations
 
 
@@ -24,6 +25,19 @@ def straight(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) ->
     """
     rate = _constant_rate(boundary, velocity_limit, spec)
     return anchor_line(boundary, rate[None], spec)[0], rate
+
+
+def gentle(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
+    """The same as ``straight``, but at first at a low rate where a motion sets off from rest and arrives moving.
+
+    Of hits that take equally long those that are found from there have three fifths of the jerk: the objective hardly
+    says how fast accelerations rise, so that it stays as it began.
+    """
+    interior, rate = straight(boundary, velocity_limit, spec)
+    at_rest = not (np.any(boundary.start_dq) or np.any(boundary.start_ddq))
+    if at_rest and np.any(boundary.goal_dq):
+        rate = rate * np.minimum(LOW + (1 - LOW) * np.linspace(0, 1, len(rate)) / RISE, 1.0)
+    return interior, rate
 
 
 def through(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec, *, middle: Array) -> tuple[Array, Array]:

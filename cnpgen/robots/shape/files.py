@@ -1,7 +1,7 @@
 """URDFs of packages, and the files that a URDF names, mostly meshes: where they are looked for, and found."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from urllib.parse import unquote, urlparse
@@ -55,14 +55,34 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
         raise RecipeError([f"{urdf}: {mistake}" for mistake in error.mistakes]) from None
 
 
+def packages_of_environment(names: Iterable[str], urdf: Path, packages: Sequence[Path] = ()) -> tuple[Path, ...]:
+    """List the folders of environment variables in which packages are found that a URDF names.
+
+    Args:
+        names: Files that it names; what is not of a package, or missing, is left out.
+        urdf: The URDF file.
+        packages: Folders that are looked at before.
+    """
+    used = []
+    for name in (each for each in names if urlparse(each).scheme in _PACKAGE):
+        place = _first(_places(name, urdf.absolute(), packages))
+        if place is not None and not any(map(place.is_relative_to, packages)):
+            used += [folder for folder in _of_environment() if place.is_relative_to(folder)][:1]
+    return tuple(dict.fromkeys(used))
+
+
 def _find(name: str, beside: Path, packages: Sequence[Path]) -> Path:
     places = list(dict.fromkeys(_places(name, beside.absolute(), packages)))
-    found = next((place for place in places if os.path.isfile(place)), None)  # noqa: PTH113 - takes names of any length
+    found = _first(places)
     if found is None:
         none = "  nowhere: a file of this kind of address is not read"
         said = "\n".join(f"  {str(place)[:LONGEST]}" for place in places) or none
         raise RecipeError([f"the file {show(name)} is missing; looked for at\n{said}{_hint(name)}"])
     return found
+
+
+def _first(places: Iterable[Path]) -> Path | None:
+    return next((place for place in places if os.path.isfile(place)), None)  # noqa: PTH113 - takes names of any length
 
 
 def _places(name: str, beside: Path, packages: Sequence[Path]) -> Iterator[Path]:
@@ -103,4 +123,7 @@ def _hint(name: str) -> str:
         return ""
     if extra := _EXTRAS.get(parts.netloc):
         return f"\nrobots of this package come with pip install 'cnpgen[{extra}]'"
-    return f"\nname a folder that holds the package as 'packages' in [robot], or in {' or '.join(_SEARCHED)}"
+    places = " or ".join(_SEARCHED)
+    return (
+        f"\nname a folder that holds the package as 'packages' in [robot] (--packages of 'cnpgen init'), or in {places}"
+    )
