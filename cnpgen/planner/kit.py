@@ -131,8 +131,9 @@ def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at
             bending_steps=meaning.bending_steps if bent else 0,
             expected_time=meaning.expected_time,
             fixed_at_goal=fixed_at_goal,
+            within_limits=meaning.within_limits,
         )
-        landing_steps = meaning.landing_steps if bent else 0
-        path = kernels.load(landed_path, steps=landing_steps, fixed_at_goal=fixed_at_goal)
+        landed = {"steps": meaning.landing_steps if bent else 0, "within_limits": meaning.within_limits}
+        path = kernels.load(landed_path, fixed_at_goal=fixed_at_goal, **landed)
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
     return Kit(prepare, path, slowing)

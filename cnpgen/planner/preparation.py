@@ -87,6 +87,7 @@ def prepare_tasks(
     bending_steps: int,
     expected_time: str = "distance",
     fixed_at_goal: int = 2,
+    within_limits: bool = False,
 ) -> Preparation:
     """Load what tasks are prepared with.
 
@@ -97,7 +98,9 @@ def prepare_tasks(
         bending_steps: Gauss-Newton steps that bend the line; 0, as where there are no equalities, leaves it straight.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
+        within_limits: Whether control points are kept within the joint limits (``Meaning``).
     """
-    line = kernels.load(line_bend, steps=bending_steps, fixed_at_goal=fixed_at_goal) if bending_steps else None
+    bent = {"steps": bending_steps, "fixed_at_goal": fixed_at_goal, "within_limits": within_limits}
+    line = kernels.load(line_bend, **bent) if bending_steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
     return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)
