@@ -45,7 +45,9 @@ def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: 
     points, interior = _points(_split(ends, n), rates, spec), slice(3, -fixed_at_goal)
     points[interior] = _sums(points[interior], _split(offsets, n))
     if steps:
-        change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+        change = bend(
+            robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
+        )
         points[interior] = _sums(points[interior], change)
     return ca.Function("landed_path", [ends_sx, offsets_sx, rates_sx, tops_sx], [ca.cse(_column(points))])
 
@@ -68,13 +70,23 @@ def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int, fixed_at_
     return ca.Function("path_bend_adjoint", [path, tops, seed], [ca.cse(gradient)])
 
 
-def _path_bend(robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool) -> tuple[Any, Any, Any]:
+def _path_bend(
+    robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool
+) -> tuple[Any, Any, Any]:
     points = problem.trajectory.path_control_points
     (path_sx, path), (tops_sx, tops) = (
         symbols("path", points * robot.n),
         symbols("tops", count_numbers(problem.obstacle)),
     )
-    change = bend(robot, problem, _split(path, robot.n), tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    change = bend(
+        robot,
+        problem,
+        _split(path, robot.n),
+        tops,
+        steps=steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=within_limits,
+    )
     return path_sx, tops_sx, _column(change)
 
 
