@@ -138,8 +138,12 @@ def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at
             fixed_at_goal=fixed_at_goal,
             within_limits=meaning.within_limits,
         )
-        landed = {"steps": meaning.landing_steps if bent else 0, "within_limits": meaning.within_limits}
-        path = kernels.load(landed_path, fixed_at_goal=fixed_at_goal, **landed)
+        path = kernels.load(
+            landed_path,
+            steps=meaning.landing_steps if bent else 0,
+            fixed_at_goal=fixed_at_goal,
+            within_limits=meaning.within_limits,
+        )
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
         pacing = make_pacing(problem, robot, kernels) if meaning.paced else None
     return Kit(prepare, path, slowing, pacing)

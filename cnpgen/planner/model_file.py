@@ -149,7 +149,7 @@ def _assembled(content: Content) -> Model:
     if meaning.expected_time not in EXPECTED_TIMES:
         raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {meaning.expected_time!r}")
     for name in ("within_limits", "paced"):
-        if not isinstance(getattr(meaning, name), bool):
+        if getattr(meaning, name) not in {True, False}:
             raise ValueError(f"{name} must be true or false, got {getattr(meaning, name)!r}")
     return Model(
         problem=problem,

@@ -13,7 +13,7 @@ from ctypes import c_double, c_long, c_void_p
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,11 +225,13 @@ def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array
     forwards = np.where(broken, np.inf, way).min(axis=(0, 1, 3))
     back = np.where(broken & np.isfinite(way), way, 0.0).max(axis=(0, 1, 3))
     out = (broken & moved).any(axis=(0, 1, 3))
-    return np.where(out, np.maximum(-back, LEAST), np.minimum(forwards, MOST))
+    found: Array = np.where(out, np.maximum(-back, LEAST), np.minimum(forwards, MOST))
+    return found
 
 
 def smallest(room: Array, linear: Array, square: Array) -> Array:
     """Smallest x > 0 with ``square x^2 + linear x = room``, elementwise; infinite where there is none."""
     with np.errstate(all="ignore"):
         below = linear + np.sqrt(linear**2 + 4 * square * room)
-        return np.asarray(np.where(below > 0, 2 * room / below, np.inf))
+        found: Array = np.where(below > 0, 2 * room / below, np.inf)
+    return found

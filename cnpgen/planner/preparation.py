@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,7 +101,7 @@ def prepare_tasks(
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
         within_limits: Whether control points are kept within the joint limits (``Meaning``).
     """
-    bent = {"steps": bending_steps, "fixed_at_goal": fixed_at_goal, "within_limits": within_limits}
-    line = kernels.load(line_bend, **bent) if bending_steps else None
+    load = partial(kernels.load, steps=bending_steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    line = load(line_bend) if bending_steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
     return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)

@@ -134,8 +134,13 @@ def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Bou
 def _landing(given: Surroundings, settings: TrainingSettings, fixed_at_goal: int) -> Landing | None:
     if settings.landing_steps == 0 or not has_equalities(given.kernels):
         return None
-    landed = {"fixed_at_goal": fixed_at_goal, "within_limits": settings.within_limits}
-    return make_landing(given.problem, given.kernels, steps=settings.landing_steps, **landed)
+    return make_landing(
+        given.problem,
+        given.kernels,
+        steps=settings.landing_steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=settings.within_limits,
+    )
 
 
 def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
