@@ -25,7 +25,7 @@ printed on stdout. docs/training.md says how to choose.
 """
 
 _CHECK = "validation rows to compare models by, half of all at most (default: 200)"
-_STEPS = ("bending_steps", "landing_steps")
+_STEPS, _FLAGS = ("bending_steps", "landing_steps"), ("within_limits", "paced")
 _SECONDS = "how long to train: CPU time of the steps; compiling and validations come on top (default: 2 min)"
 
 
@@ -77,6 +77,8 @@ def _add_how(parser: Parser) -> None:
         "--bending-steps", metavar="N", type=values.positive, help="steps that bend the line to the goal (default: 1)"
     )
     option("--landing-steps", metavar="N", type=values.positive, help="likewise of what the network gives (default: 1)")
+    option("--within-limits", action="store_true", help="keep control points within the joint limits in these steps")
+    option("--paced", action="store_true", help="let the planner fit rates to the limits behind the network")
     option(
         "--imitate",
         metavar="X",
@@ -149,7 +151,7 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
     from cnpgen.errors import UsageError
     from cnpgen.training.settings import METRICS, TrainingSettings
 
-    names = ("hidden", "layers", "batch_size", "learning_rate", "expected_time", "rate_bias", *_STEPS, "seed")
+    names = ("hidden", "layers", "batch_size", "learning_rate", "expected_time", "rate_bias", *_STEPS, *_FLAGS, "seed")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     metric = METRICS[arguments.metric or "ramped"]
     if arguments.growth is not None and metric.kind == "fixed":
@@ -165,13 +167,15 @@ def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
     lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
-    names = (*lengths, *network, "metric", "growth", "expected_time", "rate_bias", *_STEPS, "imitate", "seed", "check")
+    how = ("metric", "growth", "expected_time", "rate_bias", *_STEPS, *_FLAGS, "imitate", "seed", "check")
+    names = (*lengths, *network, *how)
     default = arguments.parser.get_default
     said = [(name, getattr(arguments, name)) for name in names]
     said[-2:-2] = [("margin", f"{term}={factor:g}") for term, factor in arguments.margin or ()]
     if arguments.start_from is not None:
         said.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
     options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
+    options = [option.removesuffix(" True") for option in options]
     places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]
     return " ".join(["cnpgen train", places[0], "-o", places[1], *options])
 

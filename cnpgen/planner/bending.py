@@ -27,7 +27,14 @@ LONGEST = 0.6  # rad: no step moves a control point further
 
 
 def bend(
-    robot: "Robot", problem: Problem, control: list[Vec], tops: Vec, *, steps: int, fixed_at_goal: int
+    robot: "Robot",
+    problem: Problem,
+    control: list[Vec],
+    tops: Vec,
+    *,
+    steps: int,
+    fixed_at_goal: int,
+    within_limits: bool = False,
 ) -> list[Vec]:
     """Return how far a path's interior control points must move.
 
@@ -38,6 +45,7 @@ def bend(
         tops: Where the obstacles are, as ``obstacle_tops`` says.
         steps: Number of Gauss-Newton steps.
         fixed_at_goal: Number of control points that the goal fixes.
+        within_limits: Whether interior control points are put back within the joint limits after every step.
     """
     control, interior = list(control), slice(3, len(control) - fixed_at_goal)
     table, response = _collocation(problem.trajectory.degree, len(control), interior)
@@ -45,9 +53,19 @@ def bend(
     for _ in range(steps):
         q = [_combined(row, control) for row in table]
         step = _gauss_newton(equality, q, tops, table[:, interior], response)
+        if within_limits:
+            step = [_kept_within(robot, *pair) for pair in zip(control[interior], step, strict=True)]
         control[interior] = [add(*pair) for pair in zip(control[interior], step, strict=True)]
         total = [add(*pair) for pair in zip(total, step, strict=True)]
     return total
+
+
+def _kept_within(robot: "Robot", point: Vec, step: Vec) -> Vec:
+    """Shorten or turn a step so that it ends within the joint limits, within which the whole path is then, too."""
+    import casadi as ca
+
+    ends = zip(robot.position_lower.tolist(), robot.position_upper.tolist(), add(point, step), strict=True)
+    return [ca.fmin(ca.fmax(end, low), high) - start for (low, high, end), start in zip(ends, point, strict=True)]
 
 
 def _gauss_newton(equality: Any, q: list[Vec], tops: Vec, inner: Array, response: Array) -> list[Vec]:

@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from cnpgen.trajectory.spec import TrajectorySpec
 
 
-def line_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
+def line_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(ends, rate, tops) -> change`` of the interior control points on the line, at a constant rate [1/s]."""
     import casadi as ca
 
     ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
     (tops_sx, tops), rate = symbols("tops", count_numbers(problem.obstacle)), ca.SX.sym("rate")
     points = _points(_split(ends, robot.n), [rate] * problem.trajectory.rate_control_points, problem.trajectory)
-    change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal)
+    change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     return ca.Function("line_bend", [ends_sx, rate, tops_sx], [ca.cse(_column(change))])
 
 
-def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
+def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(ends, offsets, rates, tops) -> path``: line plus offsets [rad], bent, with boundary control points."""
     import casadi as ca
 
@@ -45,36 +45,48 @@ def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: 
     points, interior = _points(_split(ends, n), rates, spec), slice(3, -fixed_at_goal)
     points[interior] = _sums(points[interior], _split(offsets, n))
     if steps:
-        change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal)
+        change = bend(
+            robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
+        )
         points[interior] = _sums(points[interior], change)
     return ca.Function("landed_path", [ends_sx, offsets_sx, rates_sx, tops_sx], [ca.cse(_column(points))])
 
 
-def path_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
+def path_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(path, tops) -> change`` of the interior control points."""
     import casadi as ca
 
-    path, tops, change = _path_bend(robot, problem, steps, fixed_at_goal)
+    path, tops, change = _path_bend(robot, problem, steps, fixed_at_goal, within_limits)
     return ca.Function("path_bend", [path, tops], [ca.cse(change)])
 
 
-def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int) -> Any:
+def path_bend_adjoint(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(path, tops, seed) -> gradient`` of ``seed . change`` with respect to the path, by the reverse mode."""
     import casadi as ca
 
-    path, tops, change = _path_bend(robot, problem, steps, fixed_at_goal)
+    path, tops, change = _path_bend(robot, problem, steps, fixed_at_goal, within_limits)
     seed = ca.SX.sym("seed", change.numel())
     gradient = ca.densify(ca.jtimes(change, path, seed, True))
     return ca.Function("path_bend_adjoint", [path, tops, seed], [ca.cse(gradient)])
 
 
-def _path_bend(robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int) -> tuple[Any, Any, Any]:
+def _path_bend(
+    robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool
+) -> tuple[Any, Any, Any]:
     points = problem.trajectory.path_control_points
     (path_sx, path), (tops_sx, tops) = (
         symbols("path", points * robot.n),
         symbols("tops", count_numbers(problem.obstacle)),
     )
-    change = bend(robot, problem, _split(path, robot.n), tops, steps=steps, fixed_at_goal=fixed_at_goal)
+    change = bend(
+        robot,
+        problem,
+        _split(path, robot.n),
+        tops,
+        steps=steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=within_limits,
+    )
     return path_sx, tops_sx, _column(change)
 
 

@@ -13,6 +13,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernel
 from cnpgen.planner.curves import landed_path
 from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.pacing import Pacing, make_pacing
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
 from cnpgen.plans.plans import Plans
@@ -71,11 +72,13 @@ class Kit:
         prepare: What prepares tasks.
         path: Kernel of ``curves.landed_path``.
         slowing: What slows motions from rest to rest down; None where it must not.
+        pacing: What fits rates to the limits; None where it is not wanted.
     """
 
     prepare: Preparation
     path: Kernel
     slowing: Slowing | None
+    pacing: Pacing | None = None
 
     def plan(
         self,
@@ -97,6 +100,8 @@ class Kit:
         given, tops = model.outputs(tasks), self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
         (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
         motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
+        if self.pacing is not None:
+            motion = self.pacing.paced(motion, tops)
         if self.slowing is not None:
             factor = self.slowing.factor(motion, tops)
             motion = motion if factor.max(initial=1.0) <= 1 else motion.slower(factor)
@@ -130,8 +135,14 @@ def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at
             bending_steps=meaning.bending_steps,
             expected_time=meaning.expected_time,
             fixed_at_goal=fixed_at_goal,
+            within_limits=meaning.within_limits,
         )
-        landing_steps = useful_steps(kernels, meaning.landing_steps)
-        path = kernels.load(landed_path, steps=landing_steps, fixed_at_goal=fixed_at_goal)
+        path = kernels.load(
+            landed_path,
+            steps=useful_steps(kernels, meaning.landing_steps),
+            fixed_at_goal=fixed_at_goal,
+            within_limits=meaning.within_limits,
+        )
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
-    return Kit(prepare, path, slowing)
+        pacing = make_pacing(problem, robot, kernels) if meaning.paced else None
+    return Kit(prepare, path, slowing, pacing)

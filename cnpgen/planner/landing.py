@@ -63,7 +63,9 @@ class Landing:
         return found
 
 
-def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2) -> Landing | None:
+def make_landing(
+    problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2, within_limits: bool = False
+) -> Landing | None:
     """Load the landing of a problem; None where there are no steps or no equalities.
 
     Args:
@@ -71,9 +73,10 @@ def make_landing(problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_
         kernels: Where kernels are loaded from.
         steps: Number of Gauss-Newton steps.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
+        within_limits: Whether control points are kept within the joint limits (``Meaning``).
     """
     if not useful_steps(kernels, steps):
         return None
     interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)
-    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal)
+    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     return Landing(load(path_bend), load(path_bend_adjoint), interior)

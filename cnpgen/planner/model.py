@@ -27,12 +27,16 @@ class Meaning:
         landing_steps: Likewise of what the network gave.
         expected_time: What its rates are multiples of the inverse of: the time of the "distance" at the velocity
             limits, as in the paper, or the least time in which joints could "reach" their goal states.
+        within_limits: Whether control points are put back within the joint limits after every one of these steps.
+        paced: Whether rates are then made as large, or as small, as limits allow or ask for (``pacing``).
     """
 
     path_scale: float
     bending_steps: int
     landing_steps: int
     expected_time: str = "distance"
+    within_limits: bool = False
+    paced: bool = False
 
 
 @dataclass(frozen=True)

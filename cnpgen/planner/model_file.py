@@ -26,6 +26,7 @@ from cnpgen.store.paths import require_file
 
 KIND, VERSION = "cnpgen-model", 1
 MOST_STEPS = 20  # of Gauss-Newton, each of which makes a kernel larger
+_UNSAID = {"expected_time": "distance", "within_limits": False, "paced": False}  # what files need not say
 _FORM = {
     "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
     "features": [TEXT],
@@ -96,7 +97,7 @@ def model_content(model: Model) -> Content:
     description = {
         "architecture": asdict(model.architecture),
         "features": list(model.features.blocks),
-        "meaning": {name: value for name, value in asdict(model.meaning).items() if value != "distance"},
+        "meaning": {name: value for name, value in asdict(model.meaning).items() if value != _UNSAID.get(name)},
         "rest": list(model.rest),
         "problem_sha256": model.problem.comparable_sha256,
     }
@@ -147,6 +148,9 @@ def _assembled(content: Content) -> Model:
         raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
     if meaning.expected_time not in EXPECTED_TIMES:
         raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {meaning.expected_time!r}")
+    for name in ("within_limits", "paced"):
+        if getattr(meaning, name) not in {True, False}:
+            raise ValueError(f"{name} must be true or false, got {getattr(meaning, name)!r}")
     return Model(
         problem=problem,
         architecture=architecture,

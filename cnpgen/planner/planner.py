@@ -36,7 +36,8 @@ class Planner:
     Args:
         model: A model, the path of a model file, or the name of a model that cnpgen ships.
         slow_down: Whether motions from rest to rest are slowed down uniformly as far as the limits need it. It is done
-            only by models whose training rows all begin and end at rest: then it is exact.
+            only by models whose training rows all begin and end at rest: then it is exact. False also leaves the rates
+            of models that are paced, such as airhockey-onthefly, as the network has them.
         backend: What computes kinematics and limits; by default the fastest that works.
 
     Attributes:
@@ -51,11 +52,12 @@ class Planner:
     def __init__(self, model: Model | str | Path, *, slow_down: bool = True, backend: str | None = None) -> None:
         self.model = model if isinstance(model, Model) else load_model(model)
         self._options: dict[str, Any] = {"slow_down": slow_down, "backend": backend}
+        meaning = self.model.meaning if slow_down else replace(self.model.meaning, paced=False)
         with surroundings(self.model.problem, backend) as given:
             self.robot = given.robot
             self._kit = make_kit(
                 given,
-                self.model.meaning,
+                meaning,
                 slow_down=slow_down and self.model.rests,
                 fixed_at_goal=self.model.fixed_at_goal,
             )

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +89,7 @@ def prepare_tasks(
     bending_steps: int,
     expected_time: str = "distance",
     fixed_at_goal: int = 2,
+    within_limits: bool = False,
 ) -> Preparation:
     """Load what tasks are prepared with.
 
@@ -98,8 +100,10 @@ def prepare_tasks(
         bending_steps: Gauss-Newton steps that bend the line; it stays straight where there are no equalities.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
+        within_limits: Whether control points are kept within the joint limits (``Meaning``).
     """
     steps = useful_steps(kernels, bending_steps)
-    line = kernels.load(line_bend, steps=steps, fixed_at_goal=fixed_at_goal) if steps else None
+    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    line = load(line_bend) if steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
     return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)

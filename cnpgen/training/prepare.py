@@ -66,7 +66,13 @@ def prepare_run(
     architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
     if first is not None:
         _check_first(first, architecture, settings, given, rest)
-    landing = make_landing(given.problem, given.kernels, steps=settings.landing_steps, fixed_at_goal=fixed)
+    landing = make_landing(
+        given.problem,
+        given.kernels,
+        steps=settings.landing_steps,
+        fixed_at_goal=fixed,
+        within_limits=settings.within_limits,
+    )
     run = Run(
         learner=Learner(architecture, spec, loss, settings, landing),
         names=loss.terms,

@@ -45,6 +45,8 @@ class TrainingSettings:
         rate_bias: Logarithm of the first guess of expected time over duration.
         bending_steps: Gauss-Newton steps that bend the line onto the manifold.
         landing_steps: Likewise of what the network gives.
+        within_limits: Whether both keep control points within the joint limits.
+        paced: Whether the planner fits rates to the limits behind the network; steps do not see it, validations do.
         nodes: Quadrature nodes of the loss.
         shifts: So many shifted sets of nodes are used in turn, so that nothing hides between them.
         sample_clip: Largest norm of a sample's gradient, in running medians.
@@ -68,6 +70,8 @@ class TrainingSettings:
     rate_bias: float = -0.5
     bending_steps: int = 1
     landing_steps: int = 1
+    within_limits: bool = False
+    paced: bool = False
     nodes: int = 32
     shifts: int = 16
     sample_clip: float = 30.0
@@ -102,6 +106,8 @@ class TrainingSettings:
             bending_steps=self.bending_steps,
             landing_steps=self.landing_steps,
             expected_time=self.expected_time,
+            within_limits=self.within_limits,
+            paced=self.paced,
         )
 
 

@@ -136,15 +136,20 @@ def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path
         "reach",
         "--rate-bias",
         "-0.1",
+        "--paced",
+        "--within-limits",
     ]
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL, *chosen]) == 0
     settings = load_model(path).training["settings"]
     assert (settings["learning_rate"], settings["seed"]) == (2e-3, 7)
     assert (settings["metric"]["kind"], settings["metric"]["growth"]) == ("learned", 3.0)
     assert (settings["margins"], settings["rate_bias"]) == ({"joint-velocity": 0.97, "table": 1.0}, -0.1)
-    assert load_model(path).meaning.expected_time == "reach"
-    said = "--expected-time reach --rate-bias -0.1 --margin joint-velocity=0.97 --margin table=1 --seed 7 --check 2"
-    assert said in load_model(path).training["command"]
+    meaning = load_model(path).meaning
+    assert (meaning.expected_time, meaning.paced, meaning.within_limits) == ("reach", True, True)
+    said = (
+        "--expected-time reach --rate-bias -0.1 --within-limits --paced --margin joint-velocity=0.97 --margin table=1"
+    )
+    assert f"{said} --seed 7 --check 2" in load_model(path).training["command"]
 
 
 @pytest.mark.slow

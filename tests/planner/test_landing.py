@@ -1,5 +1,7 @@
 """The landing: plans are on the manifold behind it, boundary control points stay, gradients are exact."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,15 @@ from cnpgen.planner.landing import make_landing
 from cnpgen.planner.preparation import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.conftest import columns_of, needs_compiler, some
-from tests.examples.models import accelerated, boundary_of_columns, landing_of, meaning_of, quickest, surroundings_of
+from tests.examples.models import (
+    accelerated,
+    boundary_of_columns,
+    interpreted,
+    landing_of,
+    meaning_of,
+    quickest,
+    surroundings_of,
+)
 from tests.planner.test_parts import heights, worst_tilt
 
 DATASETS = {"airhockey": "airhockey-replan", "heavy-object": "heavy-object"}
@@ -62,6 +72,25 @@ def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, na
     np.testing.assert_array_equal(landed[:, ends], path[:, ends])
     assert (landed[:, 3 : 15 - fixed] != path[:, 3 : 15 - fixed]).any(axis=(0, 2)).all()
     assert landing_of(name, fixed).land(path.astype(np.float32), tops).dtype == np.float32
+
+
+def test_a_landing_within_the_joint_limits_ends_on_them_at_most_and_its_gradients_are_exact(tiny):
+    path, tops = nearby(tiny, "airhockey")
+    given = interpreted(surroundings_of("airhockey"))
+    low, high = landing_of("airhockey").land(path, tops)[:, 3:13].min(axis=(0, 1)), given.robot.position_upper
+    robot = replace(given.robot, position_lower=low + 0.02)  # so that some control points are put back
+    kernels = replace(given.kernels, identity="narrow", arguments={**given.kernels.arguments, "robot": robot})
+    landing = make_landing(given.problem, kernels, steps=1, within_limits=True)
+    landed, random = landing.land(path, tops)[:, 3:13], np.random.default_rng(1)
+    assert (landed >= robot.position_lower - 1e-12).all()
+    assert (landed <= high).all()
+    assert (np.abs(landed - robot.position_lower) < 1e-12).any()
+    gradient, direction = random.normal(size=(2, *path.shape))
+    above, below = (landing.land(path + step * direction, tops) for step in (1e-6, -1e-6))
+    found = ((above - below) * gradient).sum(axis=(1, 2)) / 2e-6
+    np.testing.assert_allclose(
+        (landing.pull_back(path, tops, gradient) * direction).sum(axis=(1, 2)), found, rtol=1e-4, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(("name", "fixed"), some(FIXED, 2, "slow"))

@@ -49,6 +49,18 @@ def test_a_model_says_which_expected_time_it_means_unless_it_is_the_usual_one(mo
         load_model(tmp_path / "w.h5")
 
 
+def test_a_model_says_what_is_done_behind_its_network_unless_it_is_the_usual(model, tmp_path):
+    save_model(tmp_path / "m.h5", model)
+    said = json.loads(read_sealed(tmp_path / "m.h5", kind="cnpgen-model", version=1).texts["description"])["meaning"]
+    assert set(said) == {"path_scale", "bending_steps", "landing_steps"}
+    both = replace(model, meaning=replace(model.meaning, paced=True, within_limits=True, landing_steps=0))
+    save_model(tmp_path / "b.h5", both)
+    assert load_model(tmp_path / "b.h5").meaning == both.meaning
+    save_model(tmp_path / "w.h5", replace(model, meaning=replace(model.meaning, paced="often")))
+    with pytest.raises(DatasetError, match="paced must be true or false, got 'often'"):
+        load_model(tmp_path / "w.h5")
+
+
 def test_equal_models_give_equal_bytes(model, tmp_path):
     for name in ("a.h5", "b.h5"):
         save_model(tmp_path / name, model)
