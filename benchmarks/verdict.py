@@ -4,7 +4,7 @@ The second measures every constraint at every moment of the time grid, and looks
 time is the median over repetitions of the mean over all plans; both ways take turns on the plans that they share.
 
 With ``--always N``, N plans of each file are made to lie at a tolerance, a hundred-thousandth of it on either side, and
-judged at ever finer steps, and as briefly as the refiner judges them: whether they are valid must not depend on the step.
+judged at ever finer steps, and as briefly as the refiner does: whether they are valid must not depend on that.
 
     cnpgen solve airhockey-hit --n 100 -o hits.h5
     python benchmarks/verdict.py hits.h5 --always 100
@@ -124,11 +124,10 @@ class Always:
 
 
 def at_the_tolerance(problem: Problem, margin: Margin, by: float) -> Problem:
-    """Return the problem in which one constraint allows the share ``by`` more than is exceeded, and there is no other."""
+    """Return the problem with one of its constraints alone, which allows the share ``by`` more than is exceeded."""
     share = margin.excess / margin.allowed * (1 + by)
-    only = [
-        replace(each, tolerance=each.tolerance * share) for each in problem.constraint if each.reason == margin.reason
-    ]
+    found = [each for each in problem.constraint if each.reason == margin.reason]
+    only = [replace(each, tolerance=each.tolerance * share) for each in found]
     return replace(problem, constraint=tuple(only))
 
 

@@ -1,6 +1,7 @@
 """Contacts between two moments: peaks of depth are found, and nothing else changes."""
 
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +9,17 @@ import pytest
 from cnpgen.judges.plans.bow import bows
 from cnpgen.judges.plans.closer import Intervals
 from cnpgen.judges.plans.course import course
+from cnpgen.problems.load import load_problem
 from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.robot import load_robot
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.motion import Motion
+from cnpgen.world.pairs import PairDistances
 from cnpgen.world.path import PathWorld
 from tests.conftest import some
 from tests.examples.plans import bent, load
+from tests.examples.shaped_robot import write_problem
 
 judge_module = import_module("cnpgen.judges.plans.judge")  # the package has a function of the same name
 
@@ -81,26 +89,40 @@ def test_of_more_intervals_than_can_be_looked_into_those_that_hide_most_are_chos
 
 @pytest.mark.parametrize(("label", "kind"), [("transport", "object"), ("dragging", "object"), ("transport", "segment")])
 def test_what_is_certain_between_two_moments_holds_at_moments_between(label: str, kind: str) -> None:
-    """By as much as the nearest body is certain to be away all the way, it is away at every moment of a finer grid."""
     plan = bent(load(label), 0.01, seed=1)
-    world = PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
     (tops,) = obstacle_tops(plan.problem, plan.start_xyz, plan.goal_xyz)
-    s, finer = np.linspace(0, 1, 161), np.linspace(0, 1, 160 * 8 + 1)
-    found = {}
-    for phases in (s, finer):
-        states = course(plan.motion, phases)
+    assert_certain(plan.problem, plan.robot, plan.motion, tops, kind)
+
+
+@pytest.mark.parametrize("kind", ["shape", "self"])
+def test_it_holds_for_the_pieces_of_a_robot(kind: str, tmp_path: Path) -> None:
+    problem = load_problem(write_problem(tmp_path))
+    robot = load_robot(problem)
+    path = np.linspace([1.2, -0.3, 0.4, 0.0], [0.4, 0.3, 1.2, 1.0], 15)[None]
+    assert_certain(problem, robot, Motion(path, np.ones((1, 20))), np.array([0.3, 0.9]), kind)
+
+
+def assert_certain(problem: Problem, robot: Robot, motion: Motion, tops: np.ndarray, kind: str) -> None:
+    """By as much as the nearest body is certain to be away all the way, it is away at every moment of a finer grid."""
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    s, finer = np.linspace(0, 1, 41), np.linspace(0, 1, 40 * 8 + 1)
+
+    def pairs_at(phases: np.ndarray) -> PairDistances:
+        states = course(motion, phases)
         world.set_path(states.q, states.dq, states.ddq, tops)
-        found[len(phases)] = getattr(world, f"{kind}_pairs")()
-        if phases is s:
-            reach = world.reach(np.zeros(plan.robot.n))
-            ways, leave = reach @ np.abs(np.diff(states.q, axis=1)), bows(plan.motion, s, reach)
-    pairs, every = found[len(s)], found[len(finer)]
-    for least in (-0.002, 0.0, 0.02):
+        return getattr(world, f"{kind}_pairs")()
+
+    every = pairs_at(finer)
+    room = np.min([[every.measure(pair, k)[0] for k in range(len(finer))] for pair in range(len(every.bounds))], axis=0)
+    nearest = np.array([room[8 * k : 8 * k + 9].min() for k in range(40)])
+    pairs, reach = pairs_at(s), world.reach(np.abs(motion.path[0]).max(axis=0))
+    ways, leave = reach @ np.abs(np.diff(world.q, axis=1)), bows(motion, s, reach)
+    pairs.smallest()  # what it found is used
+    for least in (np.median(nearest), nearest.min() - 0.03):
         certain = pairs.between(np.full(len(pairs.bounds), least), ways, leave)
-        room = np.array([[every.measure(pair, k)[0] for k in range(len(finer))] for pair in range(len(every.bounds))])
-        nearest = np.array([room[:, 8 * k : 8 * k + 9].min() for k in range(160)]) - least
-        assert (certain <= nearest + 1e-9).all()
-        clearly = nearest > 2e-3
+        assert (certain <= nearest - least + 1e-9).all()
+        clearly = nearest - least > 2 * leave + 2e-3
+        assert clearly.any() or least > nearest.min()
         assert (certain[clearly] >= 0).all(), "what is clearly away is found to be"
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.judges.plans.sampling import AT_ENDS, FEWEST, LONGEST, sample, time_table
+from cnpgen.judges.plans.sampling import AT_ENDS, CELLS, FEW_CELLS, FEWEST, LONGEST, sample, time_table
 from cnpgen.trajectory.motion import Motion
 from tests.examples.plans import load
 
@@ -49,3 +49,20 @@ def test_a_motion_that_would_take_too_many_samples_is_not_sampled():
 def test_a_coarser_step_takes_fewer_samples():
     plan = load("transport")
     assert plan.judged(step=4e-3).samples < plan.judged().samples < plan.judged(step=5e-4).samples
+
+
+@pytest.mark.parametrize("label", ["hit", "replan", "transport"])
+def test_a_first_look_takes_a_quarter_of_the_samples_in_all_places(label: str) -> None:
+    motion = load(label).motion
+    few, all_of_them = (
+        sample(time_table(motion.rate[0], 7, cells=cells), 1e-3, 13, sparse=sparse)
+        for cells, sparse in ((FEW_CELLS, True), (CELLS, False))
+    )
+    assert few is not None
+    assert all_of_them is not None
+    assert 0.2 < len(few.s) / len(all_of_them.s) < 0.35
+    exact = motion.time_at(few.s)[0]
+    np.testing.assert_allclose(few.t, exact, atol=2e-5)
+    assert np.diff(exact).max() <= 4e-3
+    for near in (few.s, 1 - few.s):
+        assert np.sum((near > 0) & (near < 0.0501)) >= AT_ENDS // 4
