@@ -37,6 +37,7 @@ WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
 TOUCHING = 0.02  # m: as deep as links may be in a plan that is gone on from
+CERTAIN = 1e-5  # m: what is deeper at an end is not a matter of rounding
 SEEDS = 3  # ways round obstacles that are tried
 ROOM = 1.6  # times slower than bounds of speeds ask for: a start that is within them moves on more easily
 ROUNDS = 4  # from a motion that was slowed down; most need one
@@ -243,7 +244,12 @@ class Refiner:
 
         ``best`` is the best one so far; where its links hardly touch anything, it is what is gone on from first.
         """
-        hulls = Hulls(self.problem, self.robot)
+        hulls, ends = (
+            Hulls(self.problem, self.robot),
+            np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1),
+        )
+        if hulls.depth(ends, task.tops) > hulls.tolerance + CERTAIN:
+            return  # no motion will do
         touching = hulls.depth(self.check.transcription(task).positions(best.x), task.tops) < TOUCHING
         if touching:
             yield from self._on_hulls(task, best, hulls)
@@ -272,6 +278,8 @@ class Refiner:
                 return
             x = self._slow_enough(task, along_way(way, ends, self.robot.velocity_limit, self.spec))
             yield self._measured(task, x, Outcome.RESTARTED, at_any_cost=True)
+            if len(way) == 2:  # a line, which other random numbers would not change
+                return
 
     def minimise(self, task: Task, which: Pass, x: Array, hulls: Hulls | None = None) -> Result:
         """Run one pass from variables x, shape (nx,); with hulls these are kept clear in the place of capsules."""

@@ -8,6 +8,7 @@ from cnpgen.problems.robot import load_robot
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.solver.hulls import NEAR, Hulls, keeps_clear
 from cnpgen.refine.solver.sqp import DEFAULT
+from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.motion import Motion
 from tests.conftest import needs_compiler
@@ -50,6 +51,21 @@ def test_distances_are_those_of_meshes(tmp_path):
     assert (found[expected > NEAR + 1e-4] == NEAR).all()
     assert np.array_equal(hulls.clear(q.T.copy(), tops), found >= 0)
     assert hulls.depth(q.T.copy(), tops) == -found.min()
+
+
+def test_positions_that_are_no_numbers_have_no_distances(tmp_path):
+    problem = load_problem(write_problem(tmp_path))
+    robot = load_robot(problem)
+    q = np.where(np.arange(3) == 1, np.nan, 0.0) + np.zeros((robot.n, 1))
+    assert np.isnan(Hulls(problem, robot).near(q, place_obstacles(problem.obstacle))[0]).all()
+
+
+@needs_compiler
+def test_where_an_end_is_inside_an_obstacle_nothing_is_tried(tmp_path):
+    problem = narrow(tmp_path, SLOT)
+    tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
+    best = Attempt(tool.straight(inside), 0.0, 1.0, Outcome.SOLVED)
+    assert list(tool._around(inside, best)) == []
 
 
 def test_robots_without_a_shape_have_no_hulls(tmp_path):

@@ -44,6 +44,7 @@ class Hulls:
 
     Attributes:
         least: What the distances must be at least [m], shape (m,): of two links, or of a link and an obstacle.
+        tolerance: How much may be missing of them in a valid motion [m].
     """
 
     def __init__(self, problem: "Problem", robot: "Robot") -> None:
@@ -51,22 +52,23 @@ class Hulls:
         self._model, self._obstacles, self._n = robot.model, problem.obstacle, robot.n
         self._data, self._trace = self._model.createData(), Trace(self._model)
         self._bodies = Bodies(robot.shape, len(problem.obstacle), robot.n)
+        kept = [each for each in problem.constraint if isinstance(each, RobotClearance | SelfClearance)]
         links = [piece.link for piece in robot.shape.pieces]
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
         self._groups, self._unseen, least = [], [], dict[int, float]()
         seen = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.for_solvers}
-        for constraint in problem.constraint:
-            if isinstance(constraint, RobotClearance | SelfClearance):
-                around = isinstance(constraint, RobotClearance)
-                pairs = self._bodies.from_obstacles if around else self._bodies.among_links
-                which = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
-                least |= {column: max(least.get(column, 0.0), constraint.distance) for column in which}
-                self._groups.append((pairs, np.array(which), constraint.distance))
-                if not around:
-                    unseen = [frozenset((names[a], names[b])) not in seen for a, b in pairs.tolist()]
-                    self._unseen.append((pairs[np.array(unseen, bool)], which, constraint.distance))
+        for constraint in kept:
+            around = isinstance(constraint, RobotClearance)
+            pairs = self._bodies.from_obstacles if around else self._bodies.among_links
+            which = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
+            least |= {column: max(least.get(column, 0.0), constraint.distance) for column in which}
+            self._groups.append((pairs, np.array(which, np.intp), constraint.distance))
+            if not around:
+                unseen = [frozenset((names[a], names[b])) not in seen for a, b in pairs.tolist()]
+                self._unseen.append((pairs[np.array(unseen, bool)], which, constraint.distance))
         self.least = np.array([least[column] for column in range(len(columns))])
+        self.tolerance = max(each.tolerance for each in kept)
         supports = [list(each) for each in self._model.supports]
         self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
 
@@ -79,8 +81,10 @@ class Hulls:
 
         Returns:
             Distances [m], shape (K, m), ``NEAR`` beyond the least where they are larger; and all contacts, constraint
-            by constraint.
+            by constraint. Positions that are no numbers have no distances.
         """
+        if not np.isfinite(q).all():
+            return np.full((q.shape[1], len(self.least)), np.nan), []
         self._place(q, tops)
         distances = np.repeat((self.least + NEAR)[None], q.shape[1], axis=0)
         found = [self._bodies.contacts(pairs, least + NEAR) for pairs, _, least in self._groups]
