@@ -17,7 +17,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 
 WIDTH = 100
 

@@ -1,7 +1,7 @@
 """What a plan file holds: names, units and meanings of its datasets (docs/plan-format.md)."""
 
-from cnpgen.schema.units import units_of_joints
 from cnpgen.store.field import Field
+from cnpgen.store.joint_units import units_of_joints
 
 FORMAT = "cnpgen-plans"
 FORMAT_VERSION = 1

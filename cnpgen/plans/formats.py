@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.plans.format import UNITS
-from cnpgen.schema.units import unit_of, units_of_joints
 from cnpgen.store.files.atomic import committing
+from cnpgen.store.joint_units import unit_of, units_of_joints
 from cnpgen.trajectory.joined import JoinedMotion
 from cnpgen.trajectory.motion import Motion
 

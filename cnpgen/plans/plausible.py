@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
 FAR = 2.0  # from the middle of a joint's range, in halves of it: a whole half range beyond its limit

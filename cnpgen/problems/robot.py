@@ -17,7 +17,7 @@ from cnpgen.robots.robot import Robot, reduced_model
 from cnpgen.robots.shape.piece import turned
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.schema.keys import PerJoint
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 
 Array = NDArray[np.float64]
 

@@ -149,4 +149,5 @@ def _powers_of_rate(problem: Problem, world: "World", stage: ResidualKernels) ->
     w[orders * n] = 1.0, 2.0
     (g,) = stage.values(w, np.zeros((count_numbers(problem.obstacle), 2)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.maximum(np.nan_to_num(np.log2(g[:, 1] / g[:, 0]).round(), nan=1.0, posinf=1.0), 1.0)
+        powers = np.log2(g[:, 1] / g[:, 0]).round()
+    return np.asarray(np.maximum(np.nan_to_num(powers, nan=1.0, posinf=1.0), 1.0))

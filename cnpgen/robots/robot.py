@@ -15,7 +15,7 @@ from cnpgen.robots.chain import Chain, frame_of, tell_links_apart
 from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.schema.units import units_of_joints
+from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
     import pinocchio as pin

@@ -3,7 +3,6 @@
 import math
 import re
 from decimal import Decimal
-from functools import cache
 from typing import Any
 
 from cnpgen.errors import nearest
@@ -47,9 +46,6 @@ _DIMENSIONS = {
     "kg m^2": "an inertia [kg m^2]",
 }
 
-_SLIDING = {"rad": "m", "rad/s": "m/s", "rad/s^2": "m/s^2", "rad/s^3": "m/s^3", "N m": "N"}
-_BETWEEN = ", "  # units of several values in one text
-
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _QUANTITY = re.compile(rf"\s*({_NUMBER.pattern})(.*)", re.DOTALL)
 _LIST = re.compile(r"\s*\[(.*)\](.*)", re.DOTALL)
@@ -59,29 +55,6 @@ _SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"),
 def dimension(unit: str) -> str:
     """Name what is measured in an SI unit: ``"a time [s]"``."""
     return _DIMENSIONS.get(unit, f"a quantity [{unit}]")
-
-
-@cache
-def units_of_joints(turning: str, sliding: tuple[bool, ...]) -> str:
-    """Name the units of a quantity of joints: one for all, or one per joint, separated by commas, where they differ.
-
-    Args:
-        turning: Its unit at joints that turn: "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
-        sliding: Of every joint whether it slides.
-    """
-    units = [_SLIDING[turning] if slides else turning for slides in sliding]
-    return units[0] if len(set(units)) == 1 else _BETWEEN.join(units)
-
-
-def unit_of(units: str, index: int) -> str:
-    """Return the unit of one of several values, or of one of several rounds of the joints.
-
-    Args:
-        units: What ``units_of_joints`` names, or one unit.
-        index: Which value.
-    """
-    each = units.split(_BETWEEN)
-    return each[index % len(each)]
 
 
 def show(value: object) -> str:

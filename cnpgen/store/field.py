@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 
 
 @dataclass(frozen=True)

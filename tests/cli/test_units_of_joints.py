@@ -17,6 +17,7 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.robot import load_robot
 from cnpgen.refine.solver.starts import straight
+from cnpgen.store.field import Field
 from cnpgen.trajectory.boundary import Boundary
 from tests.problems.test_constraints import gantry_problem
 
@@ -66,7 +67,11 @@ def test_fields_of_datasets_have_the_unit_of_every_column(gantry: Problem, tmp_p
     field = context.joint_field("start_dq", "rad/s", "joint velocities at the start")
     assert field.unit == "m/s, m/s, m/s, rad/s, rad/s"
     assert field.units == ("m/s",) * 3 + ("rad/s",) * 2
+
+
+def test_frames_of_pandas_know_the_unit_of_every_column() -> None:
     pytest.importorskip("pandas")
+    field = Field("start_dq", "m/s, m/s, m/s, rad/s, rad/s", "joint velocities", 5, tuple(JOINTS))
     frame = make_frame({"start_dq": np.zeros((2, 5))}, [field], library="pandas")
     assert frame.attrs["units"]["start_dq.slide_z"] == "m/s"
     assert frame.attrs["units"]["start_dq.turn"] == "rad/s"

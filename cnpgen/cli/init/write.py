@@ -13,7 +13,7 @@ from cnpgen.cli.shape_rows import link_rows, pair_rows
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.units import units_of_joints
+from cnpgen.store.joint_units import units_of_joints
 
 FILES = ("problem.toml", "pipeline.toml", "dataset.toml")
 

@@ -10,7 +10,7 @@ from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointVelocity
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:

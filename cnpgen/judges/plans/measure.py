@@ -18,7 +18,7 @@ from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.problem import Problem
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
 

@@ -12,7 +12,7 @@ from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable import joint_limits
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.state import World
 

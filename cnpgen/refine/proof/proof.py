@@ -17,7 +17,7 @@ from cnpgen.errors import UsageError
 from cnpgen.refine.proof.ends import end_mistakes
 from cnpgen.refine.proof.reachable import departures, joint_limits, moments
 from cnpgen.refine.proof.table_proof import find_leaving
-from cnpgen.schema.units import unit_of
+from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
