@@ -42,6 +42,7 @@ def limit_margin(
     """
     (condition,) = constraint.measured(cast("World", world))
     allowed = constraint.allowed(condition)
+    brief &= bool(np.all(allowed > 0))  # where nothing is allowed, rounding decides
     scale = np.maximum(allowed, LEAST * np.maximum(np.abs(condition.lower), np.abs(condition.upper)))
     coefficients: Array = getattr(pieces, _COEFFICIENTS[type(constraint)])
     shares = _beyond(coefficients, condition, scale)
