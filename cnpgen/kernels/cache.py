@@ -95,7 +95,7 @@ def one_at_a_time(lock: Path) -> Iterator[None]:
     Raises:
         OSError: The lock's file cannot be made.
     """
-    with os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR), "r+b") as file:
+    with os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR, stat.S_IRUSR | stat.S_IWUSR), "r+b") as file:
         with suppress(FileNotFoundError):  # another process is done and has removed it
             lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # whatever the umask is
         end = time.monotonic() + PATIENCE
@@ -105,6 +105,7 @@ def one_at_a_time(lock: Path) -> Iterator[None]:
             yield
         finally:
             lock.unlink(missing_ok=True)
+            _let_go(file)
 
 
 def _is_held(file: IO[bytes]) -> bool:
@@ -118,6 +119,14 @@ def _is_held(file: IO[bytes]) -> bool:
     except (ImportError, OSError):  # Windows, and file systems without locks
         return False
     return False
+
+
+def _let_go(file: IO[bytes]) -> None:
+    """Give up the lock on a file, also where processes that were forked meanwhile have it open."""
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)
 
 
 def warm_folder(folder: Path) -> Path | None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+NEARLY = 1e-12  # how far off a number that is meant to be -1, 0 or 1 may be
 LINK = " (link)"  # behind the name of a link that a joint has, too
 _PLANNED = "only revolute and prismatic joints can be planned"
 _KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
@@ -130,10 +131,10 @@ def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:
     )
 
 
-def _snap(values: Array, tolerance: float = 1e-12) -> Array:
-    """Round entries within ``tolerance`` of -1, 0 or 1: a URDF's pi/2 must not cost operations in every kernel."""
+def _snap(values: Array) -> Array:
+    """Round entries that are nearly -1, 0 or 1: a URDF's pi/2 must not cost operations in every kernel."""
     values = np.array(values, float)
     nearest = np.rint(values)
-    close = (np.abs(values - nearest) < tolerance) & (np.abs(nearest) <= 1)
+    close = (np.abs(values - nearest) < NEARLY) & (np.abs(nearest) <= 1)
     values[close] = nearest[close]
     return values

@@ -1,6 +1,6 @@
 """The shallow check of a dataset: every file is there, whole, and what the blueprint says; no row is computed again."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,16 +59,11 @@ class Finding:
         return f"{self.file}: {self.problem}"
 
 
-def _silent(_file: str) -> None:
-    """Report nothing."""
-
-
-def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) -> list[Finding]:
+def check_dataset(folder: Path) -> list[Finding]:
     """Check the files of a dataset against its manifest, its sidecars and its blueprint.
 
     Args:
         folder: The dataset's folder.
-        progress: Called with the name of every shard before it is checked.
 
     Returns:
         What is wrong, by file; nothing if all is well. A dataset without manifest is checked as far as it goes.
@@ -85,7 +80,6 @@ def check_dataset(folder: Path, *, progress: Callable[[str], None] = _silent) ->
     for task in shards(blueprint):
         entry = entries.get(task.file)
         if finished or (folder / task.sidecar).exists():
-            progress(task.file)
             findings += check_shard(folder, blueprint, task, entry)
     return findings + list(_extras(folder, blueprint))
 
