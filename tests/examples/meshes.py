@@ -32,17 +32,17 @@ class Meshes:
         geometry = pin.buildGeomFromUrdfString(full, text, pin.COLLISION, package_dirs=[str(packages)])
         locked = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
         self.model, (self.geometry,) = pin.buildReducedModel(full, [geometry], locked, pin.neutral(full))
-        links = list(self.geometry.geometryObjects)
-        moving = [i for i, each in enumerate(links) if each.parentJoint > 0]
+        objects = self.geometry.geometryObjects  # places of memory that are given up when objects are added
+        links = [(each.parentJoint, self.model.frames[each.parentFrame].name) for each in objects]
+        moving = [i for i, (joint, _) in enumerate(links) if joint > 0]
         moving += [] if problem.object is None else [self._hold(problem)]
         for obstacle in problem.obstacle:
             self._add(obstacle, moving)
         self.with_obstacles = len(self.geometry.collisionPairs)
-        names = [self.model.frames[each.parentFrame].name for each in links]
         left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
-        for i, one in enumerate(links):
-            for j, other in enumerate(links[:i]):
-                if one.parentJoint != other.parentJoint and frozenset((names[i], names[j])) not in left_out:
+        for i, (one, name) in enumerate(links):
+            for j, (other, its_name) in enumerate(links[:i]):
+                if one != other and frozenset((name, its_name)) not in left_out:
                     self.geometry.addCollisionPair(pin.CollisionPair(j, i))
         self.data, self.results = self.model.createData(), self.geometry.createData()
         for request in self.results.distanceRequests:

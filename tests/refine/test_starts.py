@@ -13,6 +13,7 @@ from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Pass, Refiner
 from cnpgen.refine.solver import sqp, starts
+from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import Outcome, Refined, Task
 from cnpgen.trajectory.motion import Motion
@@ -84,10 +85,10 @@ def test_where_a_given_plan_leads_all_attempts_astray_one_is_made_from_nothing(m
     wrong = plan.motion.path[0] + np.pi
     begun: list[bool] = []
 
-    def astray(self: Refiner, asked: Task, which: Pass, x: np.ndarray) -> Result:
+    def astray(self: Refiner, asked: Task, which: Pass, x: np.ndarray, hulls: Hulls | None = None) -> Result:
         """Stay where the given plan is, until the straight line has its turn."""
         begun.append(which is self.passes.first)
-        return minimise(self, asked, which, x) if any(begun) else Result(x, 0.0, 1.0, 1, True)
+        return minimise(self, asked, which, x, hulls) if any(begun) else Result(x, 0.0, 1.0, 1, True)
 
     def none(*_: object) -> Iterator[None]:
         yield from ()
