@@ -39,7 +39,7 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "--other-rows", action="store_true", help="plan for rows that are drawn in another way than the trained ones"
     )
-    option("--no-slowing", action="store_true", help="leave motions from rest to rest as fast as the network has them")
+    option("--no-slowing", action="store_true", help="leave rates as the network has them")
     option("--force", action="store_true", help="replace PLANS, and throw away another run's PLANS.part")
     option("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
