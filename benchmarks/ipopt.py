@@ -14,7 +14,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.refiner import Pass, Refiner
+from cnpgen.refine.passes import Pass
+from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.sqp import Result, Settings
 from cnpgen.refine.solver.transcription import Linearisation, Transcription

@@ -35,9 +35,10 @@ from cnpgen.problems.record import open_problem
 from cnpgen.refine.engine import load_refiner, prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
+from cnpgen.refine.passes import Passes, default_passes
 from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.proof.proof import explain_plans
-from cnpgen.refine.refiner import Passes, Refiner, default_passes
+from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.sqp import Settings
 from cnpgen.trajectory.motion import Motion
 

@@ -16,8 +16,9 @@ from cnpgen.problems.record import ProblemRecord, open_problem
 from cnpgen.refine.deadline import refine_until
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import DEFAULT, RefineOptions
+from cnpgen.refine.passes import Passes
 from cnpgen.refine.polish import refine_task
-from cnpgen.refine.refiner import Passes, Refiner
+from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.criterion import choose_criterion
 from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.task import Refined, Task

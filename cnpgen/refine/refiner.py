@@ -1,7 +1,7 @@
 """Refining one plan: a cheap first pass, a polish on a finer grid where a check fails, other starts only then."""
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.fine import FineCheck
+from cnpgen.refine.passes import FAR, Pass, Passes, default_passes
 from cnpgen.refine.seeds import Space, along_way, find_way
 from cnpgen.refine.solver import starts
-from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate, Tightening
+from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
 from cnpgen.refine.solver.compiled import load_steps
 from cnpgen.refine.solver.criterion import Criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
@@ -32,63 +33,11 @@ Array = NDArray[np.float64]
 SLOWEST = 60.0  # s: a plan that takes longer is no start
 LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 LOST = 10.0  # boundary states further outside, in scaled units, are no problem for steps; DAQP may take hours over them
-EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the ends need the later one
-WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
-WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
-FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
 TOUCHING = 0.02  # m: as deep as links may be in a plan that is gone on from
 CERTAIN = 1e-5  # m: what is deeper at an end is not a matter of rounding
 SEEDS = 3  # ways round obstacles that are tried
 ROOM = 1.6  # times slower than bounds of speeds ask for: a start that is within them moves on more easily
 ROUNDS = 4  # from a motion that was slowed down; most need one
-FROM_NOTHING, CROWDED = 0.1, 0.05  # shares of the tolerance from nothing, where small steps still lead far
-
-
-@dataclass(frozen=True)
-class Pass:
-    """One grid with its tightening and iteration settings."""
-
-    points: int
-    tightening: Tightening
-    settings: Settings
-
-
-@dataclass(frozen=True)
-class Passes:
-    """The passes of a problem.
-
-    Attributes:
-        given: From a given plan.
-        first: From a straight line.
-        polish: On a finer grid, from where the first pass ended.
-        strict: The same with more room to every bound, where the verdict still finds something.
-        other: From other starts.
-    """
-
-    given: Pass
-    first: Pass
-    polish: Pass
-    strict: Pass
-    other: Pass
-
-
-def default_passes(problem: Problem, settings: Settings) -> Passes:
-    """Choose grids and tightening; obstacles need more room between the points of a grid."""
-    crowded = bool(problem.obstacle)
-    gentle, edge = (1e-3, LATE) if crowded else (1e-4, EARLY)
-    room = Tightening(limit=4e-3, gentle=gentle, clearance=1e-3, band=0.088, edge=edge)
-    strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE)
-    near = replace(settings, radius=WARM_RADIUS)
-    short = replace(near, max_iterations=settings.max_iterations // 2)
-    cold = replace(settings, cost_tolerance=(CROWDED if crowded else FROM_NOTHING) * settings.cost_tolerance)
-    longer = replace(cold, max_iterations=settings.max_iterations * 3 // 2)
-    return Passes(
-        Pass(128, room, replace(near, funnel=WIDE_FUNNEL, far=FAR)),
-        Pass(128, room, cold),
-        Pass(256, room, short),
-        Pass(256, strict, short),
-        Pass(192, replace(room, edge=strict.edge), longer),
-    )
 
 
 class Refiner:

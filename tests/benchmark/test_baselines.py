@@ -17,6 +17,7 @@ from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path,
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.planners.trajopt import TrajOpt, Transcription
 from cnpgen.benchmark.process import PlannerProcess
+from cnpgen.benchmark.results import answer_from_dict
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
@@ -148,7 +149,7 @@ def test_the_paths_of_cbirrt_stay_on_the_manifold_and_are_timed_by_the_velocity_
     _, robot = open_problem(task.problem)
     process = PlannerProcess("cbirrt", Setting(task.problem, time_limit=20))
     try:
-        found = process.plan(task).answer
+        found = answer_from_dict(task, process.plan(task).answer)
     finally:
         process.stop()
     assert isinstance(found, Trajectory)

@@ -11,8 +11,9 @@ from cnpgen.judges.plans import Verdict
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
+from cnpgen.refine.passes import Pass
 from cnpgen.refine.polish import refine_task
-from cnpgen.refine.refiner import Pass, Refiner
+from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled, quadratic, sqp, starts
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.compiled import CompiledSteps

@@ -10,8 +10,9 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.refine.jury import Jury
+from cnpgen.refine.passes import Pass
 from cnpgen.refine.polish import refine_task
-from cnpgen.refine.refiner import Pass, Refiner
+from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import sqp, starts
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.sqp import Result
