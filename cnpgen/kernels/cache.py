@@ -180,7 +180,10 @@ def _others(path: Path, *, writable: bool = False) -> str:
     """Say who else owns a path or may write to it, unless it may be ``writable``."""
     if not hasattr(os, "geteuid"):  # Windows
         return ""
-    found = path.lstat()
+    try:
+        found = path.lstat()
+    except FileNotFoundError:  # it was moved to its place since it was listed
+        return ""
     if found.st_uid not in {0, os.geteuid()}:
         return f"as {path} belongs to another user (uid {found.st_uid})"
     if found.st_mode & _OTHERS and not writable:

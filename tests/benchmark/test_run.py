@@ -64,6 +64,7 @@ def moody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     registry.installed.cache_clear()
 
 
+@pytest.mark.slow
 def test_whatever_a_planner_does_costs_its_own_row_only(
     moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

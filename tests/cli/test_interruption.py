@@ -72,6 +72,7 @@ def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list
     return "\n".join(others)
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("workers", some([2, 1]))
 @pytest.mark.parametrize("number", some(NAMES, 1, "slow"))

@@ -255,6 +255,20 @@ def test_a_planted_file_is_as_if_it_were_not_there_and_is_replaced(tmp_path, giv
     assert distrusted_files(folder) == []
 
 
+def test_a_file_that_is_moved_to_its_place_while_the_cache_is_looked_through_is_nobodys(tmp_path, monkeypatch):
+    (tmp_path / "tape").mkdir()
+    (tmp_path / "tape" / ".unfinished.tmp").write_text("")
+    seen = Path.is_symlink
+
+    def moved(path: Path) -> bool:
+        found = seen(path)
+        path.unlink()
+        return found
+
+    monkeypatch.setattr(Path, "is_symlink", moved)
+    assert distrusted_files(tmp_path) == []
+
+
 READ_ONLY = """
 import logging, os, sys, warnings
 from pathlib import Path

@@ -32,7 +32,7 @@ def beside(label: str, count: int = 3) -> Batch:
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
-@pytest.mark.parametrize(("rule", "shift"), [("cosine", 0.0), ("cosine", 0.3), ("gauss", 0.0)])
+@pytest.mark.parametrize(("rule", "shift"), some([("cosine", 0.3), ("cosine", 0.0), ("gauss", 0.0)], 1, "slow"))
 def test_terms_are_the_quadrature_of_what_pinocchio_and_coal_measure(label, rule, shift):
     of, given = loss(PROBLEM_OF[label], rule=rule, nodes=24), beside(label)
     found = given.evaluated(of, shift=shift).terms
@@ -141,6 +141,7 @@ def test_any_layout_and_type_of_arrays_is_taken():
         np.testing.assert_allclose(replace(given, path=path).evaluated(of).total, expected.total, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_without_a_gradient_the_terms_are_the_same_and_the_gradients_are_of_no_plan():
     of, given = loss("heavy-object"), batch("transport", 3)
     value = given.evaluated(of, gradient=False)

@@ -141,7 +141,7 @@ def test_the_planners_kernel_gives_the_paths_that_training_sees(tiny, name, fixe
     np.testing.assert_allclose(rows(found, given.robot.n), expected, atol=1e-10)
 
 
-@pytest.mark.parametrize(("name", "fixed"), FIXED[1:])
+@pytest.mark.parametrize(("name", "fixed"), some(FIXED[1:], 1, "slow"))
 def test_the_bent_line_is_the_papers_line_bent(tiny, name, fixed):
     given, boundary = quickest(name, fixed), drawn(tiny, name, 5, fixed)
     kit = make_kit(given, meaning_of(1, 0), slow_down=False, fixed_at_goal=fixed)

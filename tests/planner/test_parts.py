@@ -199,6 +199,7 @@ def test_a_torque_that_gravity_alone_exceeds_slows_nothing_down(fast):
     np.testing.assert_array_equal(weak.factor(still, tops), 1.0)
 
 
+@pytest.mark.slow
 def test_only_models_of_motions_from_rest_to_rest_slow_down(tiny):
     from cnpgen.planner.planner import Planner
 

@@ -47,6 +47,7 @@ def test_gradients_of_residuals_with_jerks_are_those_of_finite_differences() -> 
             np.testing.assert_allclose(rows[:, column], expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max() + 1e-7)
 
 
+@pytest.mark.slow
 def test_the_residuals_of_jerks_are_those_of_scipys_splines_from_the_start_on() -> None:
     plan, tool = jerky_plan("hit"), jerky_refiner("airhockey")
     motion = tool.transcription(task(plan), tool.passes.first)
@@ -56,6 +57,7 @@ def test_the_residuals_of_jerks_are_those_of_scipys_splines_from_the_start_on() 
     np.testing.assert_allclose(g[:, -plan.robot.n :], exact, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["hit", pytest.param("transport", marks=pytest.mark.extended)])
 def test_a_plan_from_nothing_keeps_the_limits_of_jerks_that_the_plan_without_them_breaks(label: str) -> None:
     plan = jerky_plan(label)
@@ -73,6 +75,7 @@ def test_a_plan_from_nothing_keeps_the_limits_of_jerks_that_the_plan_without_the
     assert not verdict(plan, plan.boundary, free.path, free.rate).valid
 
 
+@pytest.mark.slow
 def test_the_fine_check_slows_motions_down_by_the_cube_root_of_what_their_jerks_need() -> None:
     plan, tool = jerky_plan("transport"), jerky_refiner("heavy-object")
     check: FineCheck = tool.check

@@ -62,6 +62,7 @@ def test_only_motions_that_set_off_from_rest_and_arrive_moving_start_gently(labe
     assert (np.diff(rate) >= 0).all()
 
 
+@pytest.mark.slow
 def test_a_pass_that_is_stuck_where_breaking_limits_pays_goes_on_with_heavier_violations(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

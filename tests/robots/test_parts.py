@@ -110,6 +110,7 @@ def channel_problem(folder: Path, more: str = "") -> Problem:
     return load_problem(file)
 
 
+@pytest.mark.slow
 def test_a_robot_is_judged_by_the_parts_of_its_meshes(tmp_path, stand_in, monkeypatch):
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
     problem = channel_problem(tmp_path, "convex_parts = 3")

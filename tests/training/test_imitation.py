@@ -87,6 +87,7 @@ def test_demonstrations_are_the_plans_of_the_rows(shown):
     np.testing.assert_allclose(found.rate, columns["rate_control_points"], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_run_imitates_first_and_then_goes_on_with_the_loss(shown, tmp_path):
     settings = replace(SMALL, imitation=0.75, hidden=32, warm_up=10)
     trained = train_model(shown, tmp_path / "m.h5", steps=400, settings=settings, check_rows=2, workers=1)

@@ -26,6 +26,7 @@ def plans() -> Plans:
     return solve_plans(draw_boundary_problems("airhockey-pucks", 2, seed=1), workers=1).plans
 
 
+@pytest.mark.slow
 def test_plans_are_executed_there_with_the_same_outcome_up_to_the_controllers(plans: Plans) -> None:
     there, here = simulate_plans(plans, environment=CLONE, workers=1), simulate_plans(plans, workers=1)
     assert there.plant.name == "challenge"
