@@ -23,6 +23,7 @@ from cnpgen.kernels.compiled import address_of
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import speed_bounds, speed_excess, speed_residuals
+from cnpgen.planner.preparation import lanes
 from cnpgen.planner.slowing import PHASES
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
@@ -91,7 +92,7 @@ class Pacing:
         return Motion(motion.path, rate, motion.degree)
 
     def _paced(self, motion: Motion, tops: Array) -> Array:
-        path = [lanes_of(each @ motion.path) for each in self.path]
+        path = [lanes((each @ motion.path).reshape(-1, motion.path.shape[2])) for each in self.path]
         heights = np.repeat(tops.T, self.path.shape[1], axis=1)
         coefficients = self._coefficients(path, heights)
         rate = np.array(motion.rate, order="C")
@@ -175,11 +176,6 @@ def make_pacing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Pac
     if library is not None:
         library.pace.argtypes, library.pace.restype = (c_void_p,), None
     return Pacing(kernels.load(speed_residuals), kernels.load(speed_excess), lower, upper, path, rate, library)
-
-
-def lanes_of(values: Array) -> Array:
-    """Turn (N, K, n) into (n, N K)."""
-    return np.ascontiguousarray(values.reshape(-1, values.shape[2]).T)
 
 
 def pace(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array) -> None:
