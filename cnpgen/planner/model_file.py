@@ -17,8 +17,10 @@ from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.features import ARRIVAL, BLOCKS, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.plans.format import CONDITIONS
-from cnpgen.problems.record import ProblemRecord
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.record import ProblemRecord, as_record
 from cnpgen.schema.catalogue import recipes_root
+from cnpgen.store.blueprint import StoredProblem
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, check_form
 from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
@@ -63,6 +65,24 @@ def load_model(name_or_path: str | Path) -> Model:
     path = find_model(name_or_path)
     require_file(path, "a model")
     return model_from_content(path, read_sealed(path, kind=KIND, version=VERSION))
+
+
+def model_for(problem: Problem | StoredProblem) -> Model:
+    """Read the shipped model that plans for a problem, where there is one and no other.
+
+    Args:
+        problem: The problem, or its record: ``plans.problem``, ``dataset.problem``.
+
+    Raises:
+        UsageError: No shipped model plans for it, or several, which are named.
+    """
+    record = as_record(problem)
+    models = {name: load_model(path) for name, path in shipped_models().items()}
+    found = [name for name, each in models.items() if each.problem.comparable_sha256 == record.comparable_sha256]
+    if len(found) != 1:
+        which = f"several shipped models ({', '.join(found)})" if found else "no shipped model"
+        raise UsageError(f"{which} for the problem {record.name!r}: say the name or the file of a model")
+    return models[found[0]]
 
 
 def shipped_models() -> dict[str, Path]:

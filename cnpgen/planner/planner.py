@@ -15,12 +15,14 @@ from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.keeping import keep_what_is_faster
 from cnpgen.planner.kit import make_kit, surroundings
 from cnpgen.planner.model import Model
-from cnpgen.planner.model_file import load_model
+from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.strike import MEETING, State, Strikes, boundary_of_tasks, load_completion, strike_tasks
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import warn_of_far_joints
+from cnpgen.problems.problem import Problem
 from cnpgen.schema.arguments import numbers
+from cnpgen.store.blueprint import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
 from cnpgen.trajectory.moment import states_at_times
@@ -34,7 +36,8 @@ class Planner:
     """Plans with a trained model.
 
     Args:
-        model: A model, the path of a model file, or the name of a model that cnpgen ships.
+        model: A model, the path of a model file, or the name of a model that cnpgen ships; or a problem
+            (``plans.problem``, ``dataset.problem``) for which it ships just one.
         slow_down: Whether motions from rest to rest are slowed down uniformly as far as the limits need it. It is done
             only by models whose training rows all begin and end at rest: then it is exact. False also leaves the rates
             of models that are paced, such as airhockey-onthefly, as the network has them.
@@ -45,11 +48,19 @@ class Planner:
         robot: The robot of its problem.
 
     Raises:
-        UsageError: ``model`` is none, or there is no such file or shipped model.
+        UsageError: ``model`` is none, there is no such file or shipped model, or several are for the problem.
         CnpgenError: The model cannot be read, or the machine lacks what it needs.
     """
 
-    def __init__(self, model: Model | str | Path, *, slow_down: bool = True, backend: str | None = None) -> None:
+    def __init__(
+        self,
+        model: Model | Problem | StoredProblem | str | Path,
+        *,
+        slow_down: bool = True,
+        backend: str | None = None,
+    ) -> None:
+        if isinstance(model, Problem | StoredProblem):
+            model = model_for(model)
         self.model = model if isinstance(model, Model) else load_model(model)
         self._options: dict[str, Any] = {"slow_down": slow_down, "backend": backend}
         meaning = self.model.meaning if slow_down else replace(self.model.meaning, paced=False)

@@ -1,11 +1,13 @@
 """The models that are shipped: small, of the shipped problems, documented, and as good as they say."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from cnpgen.errors import UsageError
 from cnpgen.make.load import load_dataset_recipe
-from cnpgen.planner.model_file import load_model, shipped_models
+from cnpgen.planner.model_file import load_model, model_for, shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
 from cnpgen.plans.evaluate import evaluate_plans
@@ -24,6 +26,16 @@ STRICT = {
     "ur5-wipe": 0.9,
 }
 FOLDER = Path(__file__).parents[2] / "datasets" / "models"
+
+
+def test_a_problem_finds_the_planner_that_is_the_only_one_for_it_and_hears_of_several():
+    alone = load_model("ur5-wipe")
+    assert model_for(alone.problem).training == alone.training
+    with pytest.raises(UsageError, match=r"several shipped models \(heavy-object, heavy-object-anywhere\) for"):
+        Planner(load_model("heavy-object").problem)
+    other = replace(alone.problem, recipe=alone.problem.recipe.replace("0.1", "0.2"))
+    with pytest.raises(UsageError, match="no shipped model for the problem 'ur5-wipe'"):
+        Planner(other)
 
 
 def test_there_is_one_for_every_shipped_dataset_of_random_draws():
