@@ -302,6 +302,5 @@ class Refiner:
         """
         interior, rate = start
         x = np.concatenate([interior.ravel(), np.log(rate)])
-        if (factor := self.check.too_fast(task, x)) > 1:
-            x[interior.size :] -= np.log(ROOM * factor)
-        return x
+        factor = self.check.too_fast(task, x)
+        return x if factor == 1 else np.concatenate([interior.ravel(), np.log(rate / (ROOM * factor))])

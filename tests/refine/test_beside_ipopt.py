@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ipopt import Programme, lagrangian_hessian, minimise_with_ipopt, with_ipopt
+from cnpgen.refine.solver import starts
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.criterion import Criterion
 from cnpgen.refine.solver.sqp import Settings
@@ -21,7 +22,8 @@ PROBLEMS = {"hit": "airhockey", "replan": "airhockey", "transport": "heavy-objec
 @pytest.mark.parametrize("label", ["hit", pytest.param("replan", marks=more)])
 def test_a_pass_ends_at_least_as_good_as_ipopts_from_the_same_start(label: str) -> None:
     asked, tool = task(load(label)), refiner(PROBLEMS[label])
-    which, x = tool.passes.first, tool.straight(asked)
+    interior, rate = starts.straight(asked.boundary, tool.robot.velocity_limit, tool.spec)
+    which, x = tool.passes.first, np.concatenate([interior.ravel(), np.log(rate)])
     own, other = (each.minimise(asked, which, x) for each in (tool, with_ipopt(tool)))
     assert max(own.violation, other.violation) < Settings().violation_tolerance
     assert not np.array_equal(own.x, other.x)
