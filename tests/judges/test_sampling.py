@@ -52,7 +52,7 @@ def test_a_coarser_step_takes_fewer_samples():
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
-def test_a_first_look_takes_a_quarter_of_the_samples_in_all_places(label: str) -> None:
+def test_a_first_look_takes_fewer_samples_but_not_near_the_ends(label: str) -> None:
     motion = load(label).motion
     few, all_of_them = (
         sample(time_table(motion.rate[0], 7, cells=cells), 1e-3, 13, sparse=sparse)
@@ -60,9 +60,9 @@ def test_a_first_look_takes_a_quarter_of_the_samples_in_all_places(label: str) -
     )
     assert few is not None
     assert all_of_them is not None
-    assert 0.2 < len(few.s) / len(all_of_them.s) < 0.35
+    assert 0.2 < len(few.s) / len(all_of_them.s) < 0.5
     exact = motion.time_at(few.s)[0]
     np.testing.assert_allclose(few.t, exact, atol=2e-5)
     assert np.diff(exact).max() <= 4e-3
     for near in (few.s, 1 - few.s):
-        assert np.sum((near > 0) & (near < 0.0501)) >= AT_ENDS // 4
+        assert np.sum((near > 0) & (near < 0.0501)) >= AT_ENDS  # torques have peaks there that fewer do not show

@@ -77,7 +77,7 @@ def sample(
         step: Time step [s].
         spans: Number of intervals between the knots of the finer spline.
         also: Further phases.
-        sparse: Whether ``SPARSE`` times fewer are enough, half of them in every span.
+        sparse: Whether ``SPARSE`` times fewer in time are enough, half of them in every span, and all near the ends.
 
     Returns:
         The samples, or None if the motion takes longer than ``LONGEST`` steps.
@@ -88,7 +88,7 @@ def sample(
     fewer = SPARSE if sparse else 1
     count = max(FEWEST // fewer, int(np.ceil(SPARE * duration / (fewer * step))) + 1)
     by_time = np.interp(np.linspace(0, duration, count), table[1], table[0])
-    near = END * np.linspace(0, 1, AT_ENDS // fewer + 1) ** 2
+    near = END * np.linspace(0, 1, AT_ENDS + 1) ** 2
     evenly = np.linspace(0, 1, (PER_SPAN // 2 if sparse else PER_SPAN) * spans + 1)
     s = np.unique(np.concatenate([by_time, evenly, near, 1 - near, list(also)]))
     return Samples(s, times(s, table))
