@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled import address_of
-from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import speed_bounds, speed_excess, speed_residuals
 from cnpgen.planner.preparation import lanes
-from cnpgen.planner.slowing import PHASES
+from cnpgen.planner.speeds import BLOCK, Speeds, load_speeds
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spline import basis, chebyshev
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -39,7 +36,6 @@ FIXED = 2  # control points of the rate at either end
 SWEEPS, SHARE = 2, 0.5
 MOST, LEAST = 0.5, -0.3  # of itself: no control point is changed more at once
 ROUNDED = 1e-9  # of a limit: what a boundary condition may be beyond it
-BLOCK = 64  # motions at once, so that arrays stay in the cache
 
 
 class _Pacing(ctypes.Structure):
@@ -55,25 +51,13 @@ class _Pacing(ctypes.Structure):
 
 
 @dataclass(frozen=True)
-class Pacing:
+class Pacing(Speeds):
     """Fits rates of one problem's motions to its limits; made by ``make_pacing``.
 
     Attributes:
-        residuals: Kernel of ``expressions.speed_residuals``.
-        excess: Kernel of ``expressions.speed_excess``.
-        lower: Lower bounds of its values, shape (m,).
-        upper: Upper bounds, shape (m,).
-        path: Basis of p, p' and p'' at K phases, shape (3, K, C).
-        rate: Basis of r and r', shape (2, K, R).
         library: That of pace.c; None where kernels are not compiled.
     """
 
-    residuals: Kernel
-    excess: Kernel
-    lower: Array
-    upper: Array
-    path: Array
-    rate: Array
     library: ctypes.CDLL | None
 
     def paced(self, motion: Motion, tops: Array) -> Motion:
@@ -166,16 +150,12 @@ def make_pacing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Pac
     Raises:
         UsageError: The problem bounds the jerk, which is no quadratic of the rate.
     """
-    spec, s = problem.trajectory, chebyshev(PHASES)
     if problem.path_orders > 3:
         raise UsageError(f"plans of {problem.name!r} cannot be paced: its jerk is bounded")
-    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(3)])
-    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(2)])
-    lower, upper, _ = speed_bounds(robot, problem)
     library = kernels.load_source(SOURCE)
     if library is not None:
         library.pace.argtypes, library.pace.restype = (c_void_p,), None
-    return Pacing(kernels.load(speed_residuals), kernels.load(speed_excess), lower, upper, path, rate, library)
+    return Pacing(**vars(load_speeds(problem, robot, kernels)), library=library)
 
 
 def pace(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array) -> None:

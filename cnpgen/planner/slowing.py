@@ -6,51 +6,27 @@ b and c, and the smallest k at which every g is within its bounds follows in clo
 is ``g0 + d / k^3``.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import speed_bounds, speed_excess, speed_residuals
+from cnpgen.planner.speeds import BLOCK, Speeds, load_speeds
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spline import basis, chebyshev
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-PHASES = 128
 SLOWEST = 3.0  # no motion is slowed down more: what breaks limits by so much is no plan
 SPARE = 2e-4  # relative: between two phases a limit may be exceeded by about this much
-BLOCK = 64  # motions at once, so that arrays stay in the cache
 
 
-@dataclass(frozen=True)
-class Slowing:
-    """Finds how much slower motions of one problem must be; made by ``make_slowing``.
-
-    Attributes:
-        excess: Kernel of ``expressions.speed_excess``.
-        residuals: Kernel of ``expressions.speed_residuals``.
-        lower: Lower bounds of its values, shape (m,).
-        upper: Upper bounds, shape (m,).
-        cubic: Which of the values depend on the jerk, shape (m,).
-        path: Basis of p and its derivatives at K phases, shape (orders, K, C).
-        rate: Basis of r and its derivatives, shape (orders - 1, K, R).
-    """
-
-    excess: Kernel
-    residuals: Kernel
-    lower: Array
-    upper: Array
-    cubic: NDArray[np.bool_]
-    path: Array
-    rate: Array
+class Slowing(Speeds):
+    """Finds how much slower motions of one problem must be; made by ``make_slowing``."""
 
     def factor(self, motion: Motion, tops: Array) -> Array:
         """Smallest factor, at least 1, by which each of N motions from rest to rest must be slower.
@@ -112,11 +88,7 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
         robot: Its robot.
         kernels: Where kernels are loaded from.
     """
-    spec, s, orders = problem.trajectory, chebyshev(PHASES), problem.path_orders
-    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)])
-    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)])
-    excess, residuals = kernels.load(speed_excess), kernels.load(speed_residuals)
-    return Slowing(excess, residuals, *speed_bounds(robot, problem), path=path, rate=rate)
+    return Slowing(**vars(load_speeds(problem, robot, kernels)))
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:

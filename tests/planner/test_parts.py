@@ -10,7 +10,8 @@ from scipy.interpolate import BSpline
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.planner.expressions import equality_residuals, useful_steps
 from cnpgen.planner.kit import make_kit
-from cnpgen.planner.slowing import PHASES, SLOWEST, make_slowing
+from cnpgen.planner.slowing import SLOWEST, make_slowing
+from cnpgen.planner.speeds import PHASES
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.obstacles import obstacle_tops
