@@ -14,7 +14,7 @@ from cnpgen.benchmark.run import run_benchmark
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.schema import registry
+from tests.examples.installed import installed_planner
 
 BAD = """
 import os, time
@@ -54,14 +54,8 @@ class Moody(BenchmarkPlanner):
 def moody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A planner of an installed package."""
     (tmp_path / "moody.py").write_text(BAD, encoding="utf-8")
-    about = tmp_path / "moody-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: moody\nVersion: 1.0\n", encoding="utf-8")
-    (about / "entry_points.txt").write_text("[cnpgen.planners]\nmoody = moody:Moody\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    registry.installed.cache_clear()
-    yield "moody"
-    registry.installed.cache_clear()
+    with installed_planner(tmp_path, "moody", "moody:Moody", monkeypatch):
+        yield "moody"
 
 
 @pytest.mark.slow

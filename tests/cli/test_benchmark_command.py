@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.main import main
-from cnpgen.schema import registry
+from tests.examples.installed import installed_planner
 
 
 def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture[str]) -> None:
@@ -20,16 +20,8 @@ def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture
 def test_the_list_says_of_a_planner_that_cannot_be_imported_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    about = tmp_path / "mine-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n", encoding="utf-8")
-    (about / "entry_points.txt").write_text("[cnpgen.planners]\nmine = no_such_module:Mine\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    registry.installed.cache_clear()
-    try:
+    with installed_planner(tmp_path, "mine", "no_such_module:Mine", monkeypatch):
         assert main(["benchmark", "--list", "--json"]) == 0
-    finally:
-        registry.installed.cache_clear()
     found = json.loads(capsys.readouterr().out)
     assert "No module named 'no_such_module'" in found["planners"]["mine"]
     assert "cnp-b" in found["planners"]
