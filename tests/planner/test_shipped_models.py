@@ -11,6 +11,7 @@ from cnpgen.planner.model_file import load_model, model_for, shipped_models
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.requests import read_rows
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.problems.load import load_problem
 from cnpgen.problems.record import record_problem
 from tests.conftest import some
 from tests.examples.example_robots import SHIPPED, with_robots
@@ -33,6 +34,8 @@ def test_a_problem_finds_the_planner_that_is_the_only_one_for_it_and_hears_of_se
     assert model_for(alone.problem).training == alone.training
     with pytest.raises(UsageError, match=r"several shipped models \(heavy-object, heavy-object-anywhere\) for"):
         Planner(load_model("heavy-object").problem)
+    with pytest.raises(UsageError, match="airhockey-hit, airhockey-onthefly, airhockey-replan"):
+        Planner(record_problem(load_problem("airhockey")))
     other = replace(alone.problem, recipe=alone.problem.recipe.replace("0.1", "0.2"))
     with pytest.raises(UsageError, match="no shipped model for the problem 'ur5-wipe'"):
         Planner(other)
