@@ -190,13 +190,20 @@ I void vsincos(v x, v *s, v *c) {
   *c = (v)((vi)b ^ (((quadrant + 1) & 2) << sign));
 }
 
-I v load(const real *p, long k, long n) {
-  if (k + W <= n) return *(const vu *)(p + k);
+/* The last lanes, fewer than W of them. They are not inlined: a kernel may have a thousand loads and stores. */
+static __attribute__((noinline, cold)) v load_last(const real *p, long k, long n) {
   v x;
   for (int i = 0; i < W; i++) x[i] = p[k + i < n ? k + i : n - 1];
   return x;
 }
-I void store(real *p, long k, long n, v x) {
-  if (k + W <= n) { *(vu *)(p + k) = x; return; }
+static __attribute__((noinline, cold)) void store_last(real *p, long k, long n, v x) {
   for (int i = 0; k + i < n; i++) p[k + i] = x[i];
+}
+I v load(const real *p, long k, long n) {
+  if (k + W <= n) return *(const vu *)(p + k);
+  return load_last(p, k, n);
+}
+I void store(real *p, long k, long n, v x) {
+  if (k + W <= n) *(vu *)(p + k) = x;
+  else store_last(p, k, n, x);
 }

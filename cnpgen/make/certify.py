@@ -82,7 +82,8 @@ class CertifiedPlan(Stage):
             given = None if planner is None else planner.plan_batch(asked(columns, planner)).motion
             with one_thread():
                 motion, valid = solve(columns, given)
-            draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(len(motion), -1).T)
+            count, points, joints = motion.path.shape
+            draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(count, points * joints).T)
             draws["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
             draws["duration"] = motion.duration()[None]
             draws.reject(valid, NO_PLAN)

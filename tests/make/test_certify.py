@@ -30,6 +30,7 @@ from cnpgen.refine.task import Refined
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.validate.dataset import validate_dataset
+from tests.conftest import Prepare, run_stages
 
 ROWS = 12
 
@@ -71,6 +72,17 @@ def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(folder:
     assert (found.plans.duration <= plans.duration * (1 + 2e-3)).all()
     save_plans(tmp_path / "stored.h5", plans)
     assert load_plans(tmp_path / "stored.h5").source == "dataset airhockey-hit-certified, seed 20261121, split train"
+
+
+@pytest.mark.parametrize("model", [None, "airhockey-hit"])
+def test_a_round_whose_draws_are_all_rejected_needs_no_plans(model: str | None, prepare: Prepare) -> None:
+    prepared = prepare(certified(load_dataset_recipe("airhockey-hit"), model=model).pipeline)
+    (*_, (_, plan)), draws = prepared._stages, run_stages(prepared, 4)
+    draws.reject(np.zeros(len(draws.alive), bool), "all of them")
+    plan(draws, np.random.default_rng(0))
+    assert [draws[name].shape for name in ("path_control_points", "rate_control_points", "duration")] == [
+        (90, 0), (20, 0), (1, 0)
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

@@ -57,6 +57,18 @@ def test_blocks_of_another_seed_split_or_index_share_no_row(prepared, whole, oth
     np.testing.assert_array_equal(columns["sample_id"], [np.arange(first, first + 500)])
 
 
+def test_every_stage_takes_a_round_that_has_no_draws_left(prepared):
+    for emptied in range(1, len(prepared._stages) + 1):
+        draws, random = Round(8), random_generator(SEED, "train", 0)
+        for _, work in prepared._stages[:emptied]:
+            work(draws, random)
+        draws.reject(np.zeros(len(draws.alive), bool), "all of them")
+        for _, work in prepared._stages[emptied:]:
+            work(draws, random)
+        prepared._accept(draws, random)
+        assert {draws[field.name].shape[1] for field in prepared.fields[:-2]} == {0}
+
+
 def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple[dict[str, np.ndarray], Fates]:
     """Make a block piece by piece."""
     made = [
