@@ -1,7 +1,7 @@
 """A tape: an SX function as a flat list of scalar operations, and the description of the loop or grid that runs it."""
 
 import hashlib
-import io
+import json
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -36,9 +36,9 @@ class Loop:
 
 
 Axes = Literal["point", "lane", "node", "fixed"]
-AXES: tuple[Axes, ...] = ("point", "lane", "node", "fixed")
 Dtype = Literal["float64", "float32"]
 DTYPES: tuple[Dtype, ...] = ("float64", "float32")
+COLUMNS = {"constant": "<f8", "a": "<i4", "b": "<i4", "operation": "<i2"}  # how they are stored, the widest first
 
 
 @dataclass(frozen=True)
@@ -91,20 +91,16 @@ class Tape:
 
     def to_bytes(self) -> bytes:
         """Serialize, with a checksum; equal tapes give equal bytes."""
-        buffer = io.BytesIO()
-        loop = [self.loop.tolerance, float(self.loop.limit)] if self.loop else []
-        axes = (self.grid.arguments, self.grid.results) if self.grid else ((), ())
-        header = [
-            np.frombuffer(self.name.encode(), np.uint8),
-            np.array(self.inputs),
-            np.array(self.outputs),
-            np.array(loop),
-            *(np.array([AXES.index(name) for name in names], np.int8) for names in axes),
-            np.array(DTYPES.index(self.dtype)),
-        ]
-        for array in (*header, self.operation, self.a, self.b, self.constant):
-            np.save(buffer, array, allow_pickle=False)
-        content = buffer.getvalue()
+        header = {
+            "name": self.name,
+            "inputs": self.inputs,
+            "outputs": self.outputs,
+            "loop": (self.loop.tolerance, self.loop.limit) if self.loop else None,
+            "grid": (self.grid.arguments, self.grid.results) if self.grid else None,
+            "dtype": self.dtype,
+        }
+        columns = [getattr(self, name).astype(kind).tobytes() for name, kind in COLUMNS.items()]
+        content = b"".join([json.dumps(header).encode(), b"\n", *columns])
         return hashlib.sha256(content).digest() + content
 
     @classmethod
@@ -117,24 +113,21 @@ class Tape:
         checksum, content = data[:32], data[32:]
         if hashlib.sha256(content).digest() != checksum:
             raise ValueError("damaged tape: its checksum is wrong")
-        buffer = io.BytesIO(content)
-        name, inputs, outputs, loop, arguments, results, dtype, *program = (
-            np.load(buffer, allow_pickle=False) for _ in range(11)
-        )
-        iteration = Loop(float(loop[0]), int(loop[1])) if len(loop) else None
-        grid = GridSpec(tuple(AXES[i] for i in arguments), tuple(AXES[i] for i in results)) if len(arguments) else None
-        operation, a, b, constant = program
+        head, _, body = content.partition(b"\n")
+        header = json.loads(head)
+        sizes = {name: np.dtype(kind).itemsize for name, kind in COLUMNS.items()}
+        count, first, columns = len(body) // sum(sizes.values()), 0, {}
+        for name, kind in COLUMNS.items():
+            columns[name] = np.frombuffer(body, kind, count, first)
+            first += count * sizes[name]
         return cls(
-            bytes(name).decode(),
-            tuple(inputs.tolist()),
-            tuple(outputs.tolist()),
-            operation,
-            a,
-            b,
-            constant,
-            loop=iteration,
-            grid=grid,
-            dtype=DTYPES[int(dtype)],
+            name=header["name"],
+            inputs=tuple(header["inputs"]),
+            outputs=tuple(header["outputs"]),
+            **columns,
+            loop=Loop(*header["loop"]) if header["loop"] else None,
+            grid=GridSpec(*map(tuple, header["grid"])) if header["grid"] else None,
+            dtype=header["dtype"],
         )
 
 

@@ -31,7 +31,7 @@ def beside(label: str, count: int = 3) -> Batch:
     return replace(given, rate=given.rate * 1.5)
 
 
-@pytest.mark.parametrize("label", ["hit", "replan", "transport"])
+@pytest.mark.parametrize("label", some(["hit", "replan", "transport"], 2, "slow"))
 @pytest.mark.parametrize(("rule", "shift"), some([("cosine", 0.3), ("cosine", 0.0), ("gauss", 0.0)], 1, "slow"))
 def test_terms_are_the_quadrature_of_what_pinocchio_and_coal_measure(label, rule, shift):
     of, given = loss(PROBLEM_OF[label], rule=rule, nodes=24), beside(label)

@@ -69,7 +69,7 @@ def test_values_and_steps_are_those_of_numpy_and_daqp(label: str, held: bool, mo
 
 
 @pytest.mark.parametrize("given", [False, True], ids=["from nothing", "from a plan"])
-@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("label", some(LABELS, 2, "slow"))
 def test_plans_are_as_good_as_those_of_numpy_and_daqp(label: str, given: bool) -> None:
     plan = load(label)
     tool, jury = refiner_of(plan), Jury(plan.problem, plan.robot, degree=7)

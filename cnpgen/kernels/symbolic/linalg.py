@@ -13,11 +13,16 @@ Vec = list[Scalar]
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
-    """Return the sum of products of two vectors of equal length."""
-    total: Scalar = 0.0
-    for x, y in zip(a, b, strict=True):
-        total = total + x * y
-    return total
+    """Return the sum of products of two vectors of equal length; products with a zero that is a float are left out.
+
+    CasADi leaves them out as well, but takes ten times as long to find them.
+    """
+    products = [x * y for x, y in zip(a, b, strict=True) if not (_is_zero(x) or _is_zero(y))]
+    return sum(products[1:], products[0]) if products else 0.0
+
+
+def _is_zero(x: Scalar) -> bool:
+    return isinstance(x, float) and x == 0.0
 
 
 def cross(a: Vector, b: Vector) -> list[Scalar]:
