@@ -78,7 +78,7 @@ def look_at_peaks(survey: Survey) -> Iterator[tuple[Measured, Margin]]:
         of, part, ends = rows.promising(largest)
         if not len(of):
             break
-        s = np.linspace(*ends.T, FINER + 1, axis=1)
+        s = np.linspace(ends[:, 0], ends[:, 1], FINER + 1, axis=1)
         survey.move(s.ravel())
         rows = _Rows(of, part, s, np.empty_like(s))
         for k in np.unique(of).tolist():
