@@ -21,7 +21,7 @@ from cnpgen.judges.plans.verdict import Margin
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-CLOSE = 1e-7  # of what is allowed: less is not looked for where it decides whether more is exceeded than that
+CLOSE = 1e-8  # of what is allowed: less is not looked for where it decides whether more is exceeded than that
 ROUGH = 1e-2  # the same elsewhere
 FINER = 6  # parts of an interval
 ROUNDS = 10  # of divisions, at most; a smooth maximum takes two or three, a kink one per factor of FINER
