@@ -27,7 +27,7 @@ FINER = 6  # parts of an interval
 ROUNDS = 10  # of divisions, at most; a smooth maximum takes two or three, a kink one per factor of FINER
 MOST = 256  # intervals of all conditions that are divided at a time
 TINY = 1e-30  # of what is allowed
-APART = 1e-7  # in phase: of samples nearer to each other differences would be rounding
+APART = 1e-7  # in phase: cells of which one sample counts; differences of nearer ones would be rounding
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,9 @@ def _again(survey: Survey, each: Measured, s: Array) -> Measured:
 
 def _first(s: Array, measured: Sequence[Measured]) -> _Rows:
     """Return the samples of every value of every condition."""
-    apart, none = np.diff(s, prepend=-1.0) > APART, np.zeros(0, np.intp)
+    none = np.zeros(0, np.intp)
+    apart = np.flatnonzero(np.diff(np.floor(s / APART), prepend=-1.0) > 0)  # the first one of each cell
+    apart = apart[np.diff(s[apart], prepend=-1.0) > APART / 2]
     of = np.concatenate([none, *(np.full(len(each.share), k) for k, each in enumerate(measured))])
     part = np.concatenate([none, *(np.arange(len(each.share)) for each in measured)])
     share = np.concatenate([np.empty((0, len(s))), *(each.share for each in measured)])
