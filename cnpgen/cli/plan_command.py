@@ -65,9 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
     plans = planner.plan_batch(requests.boundary, sample_id=requests.sample_id, columns=requests.columns)
     seconds = time.perf_counter() - begun
     if not arguments.quiet:
-        each = 1e6 * seconds / max(len(plans), 1)
-        mean = f", mean motion time {plans.duration.mean():.3f} s" if len(plans) else ""
-        print(f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms, {each:.0f} us each{mean}", file=sys.stderr)
+        text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"
+        if len(plans):
+            text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {plans.duration.mean():.3f} s"
+        print(text, file=sys.stderr)
     if arguments.refine:
         return refine_and_save(arguments, plans, arguments.out, title=f"refining plans of {arguments.model}")
     return _save(arguments, plans, seconds)

@@ -50,7 +50,7 @@ def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ..
         plans = [(index, verdict) for index, verdict in enumerate(found.verdicts) if str(verdict.reason) == reason]
         index, worst = max(plans, key=lambda plan: _severity(plan[1]))
         if not worst.valid:
-            why = _why(worst, found.step)
+            why = _why(worst)
             rows.append((reason, f"{number:,}", f"plan {index}{why and f': {why}'}"))
     return rows
 
@@ -60,16 +60,13 @@ def _figure(form: str, value: float) -> str:
     return form.format(value) if abs(value) < LONG else f"{value:.3g}"
 
 
-def _why(verdict: "Verdict", step: float) -> str:
+def _why(verdict: "Verdict") -> str:
     """Say what decided, as far as there is more to say than the reason."""
-    from cnpgen.judges.plans.judge import LONGEST_STEP
     from cnpgen.judges.plans.sampling import LONGEST
     from cnpgen.judges.plans.verdict import Reason
 
     if verdict.reason == Reason.TOO_LONG:
-        time = f"{verdict.metrics.duration:.3g} s"
-        text = f"{time} are more than {LONGEST:,} steps of {1e3 * step:g} ms"
-        return text + ("; with a longer --step it is looked at" if step < LONGEST_STEP else "")
+        return f"{verdict.metrics.duration:.3g} s are more than {LONGEST:,.0f} s"
     return str(verdict.worst or "")
 
 
@@ -115,7 +112,7 @@ def listing_text(found: "Evaluation") -> str:
         values = [(METRICS[name][2], metrics[index].get(name)) for name in shown]
         figures = ["-" if value is None else _figure(form, value) for form, value in values]
         verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
-        why = _why(verdict, found.step) or "-"
+        why = _why(verdict) or "-"
         rows.append((str(index), str(sample), str(verdict.reason), *figures, why))
     return "\n".join(_columns(rows, left={2, len(rows[0]) - 1}))
 

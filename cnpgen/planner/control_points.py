@@ -5,6 +5,7 @@ The boundary control points follow from the rates, so that boundary conditions h
 line that hangs on two of them: gradients of the path reach the rates on both ways.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -90,7 +91,7 @@ def pull_back(
     for each in boundary_slopes(tasks.boundary, points.rate, spec):
         rates[:, each.variable] += np.einsum("ij,ij->i", total[:, each.point], each.slope)
     rates *= points.rate
-    return scale * interior.reshape(len(interior), -1), rates
+    return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
 
 
 @lru_cache(maxsize=16)

@@ -75,6 +75,8 @@ def strike_tasks(
     columns = [*parts, behind(place, angle, meeting), angle, np.atleast_2d(numbers("share", share))]
     count = max(values.shape[1] for values in columns)
     for name, values in zip(GIVEN, columns, strict=True):
+        if not values.size:
+            raise UsageError(f"{name} is of no strike")
         if values.shape[1] not in {1, count}:
             raise UsageError(f"{name} is given for {values.shape[1]:,} strikes, something else for {count:,}")
     return completion(dict(zip(GIVEN, columns, strict=True)))

@@ -129,6 +129,10 @@ class Refiner:
         if given is not None or not np.array_equal(even, line):  # what all of these began with may have led them astray
             for attempt in self._passes(task, None, None, even):
                 yield replace(attempt, outcome=Outcome.RESTARTED)
+                best = attempt if attempt.is_better(best) else best
+        for attempt in self._passes(task, best.x, None, even):
+            yield replace(attempt, outcome=Outcome.RESTARTED)
+            best = attempt if attempt.is_better(best) else best
         if task.until == np.inf and keeps_clear(self.problem, self.robot):
             yield from self._around(task, best)
 

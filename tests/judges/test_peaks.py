@@ -1,6 +1,8 @@
 """Smooth conditions between moments: their largest value does not depend on where one looks first."""
 
+from collections.abc import Callable
 from importlib import import_module
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,36 +48,55 @@ def test_the_largest_excess_at_a_kink_of_a_funnel_is_found() -> None:
     assert coarse.excess == pytest.approx(fine.excess, abs=1e-2 * fine.allowed)
 
 
+class OfOneCondition:
+    """A survey of one condition, whose excess is a function of the phase and that was looked at evenly."""
+
+    def __init__(self, share: Callable[[np.ndarray], np.ndarray], samples: int = 24) -> None:
+        self._share, s = share, np.linspace(0, 1, samples)
+        self.samples, self.measured, self.asked = Samples(s, s), self.measure(None, s), 0
+
+    def move(self, s: np.ndarray) -> None:
+        self.asked += len(s)
+
+    def measure(self, _: object, s: np.ndarray) -> list[SimpleNamespace]:
+        return [SimpleNamespace(constraint=None, condition=SimpleNamespace(name="it"), share=self._share(s)[None])]
+
+    def margin(self, found: SimpleNamespace, _: np.ndarray) -> float:
+        return float(found.share.max())
+
+    def largest(self) -> float:
+        """The largest excess that the samples and a closer look show."""
+        return max([self.measured[0].share.max(), *(margin for _, margin in judge_module.look_at_peaks(self))])
+
+
 @pytest.mark.parametrize("top", [1.2, 1 + 1e-6, 1 - 1e-6, 0.9])
 @pytest.mark.parametrize("first", [0.3, 0.5123])
 def test_a_sharp_smooth_peak_is_climbed_to_its_top_where_that_decides(first: float, top: float) -> None:
     """One condition with a peak between samples: more samples are taken until its top is known."""
-    asked: list[np.ndarray] = []
+    survey = OfOneCondition(lambda s: top - 40 * np.square(s - first) - 300 * np.abs(s - first) ** 3)
+    largest = survey.largest()
+    assert largest == pytest.approx(top, abs=1e-2)
+    assert (largest > 1) == (top > 1)
+    assert survey.asked < 100
 
-    class Condition:
-        name = "peak"
 
-    class Measured:
-        constraint, condition = None, Condition()
+def _rises_slowly_and_falls_fast(s: np.ndarray) -> np.ndarray:
+    return np.exp(8 * (s - 0.5)) - 0.3 * np.exp(40 * (s - 0.5))
 
-        def __init__(self, s: np.ndarray) -> None:
-            self.share = top - 40 * np.square(s - first)[None] - 300 * np.abs(s - first)[None] ** 3
 
-    class Survey:
-        samples = Samples(np.linspace(0, 1, 24), np.linspace(0, 1, 24))
-        measured = (Measured(np.linspace(0, 1, 24)),)
+def _begins_near_its_top(s: np.ndarray) -> np.ndarray:
+    return -30 * np.square(s - 0.01)
 
-        def move(self, s: np.ndarray) -> None:
-            asked.append(s)
 
-        def measure(self, _: object, s: np.ndarray) -> list[Measured]:
-            return [Measured(s)]
+def _has_two_tops_in_one_interval(s: np.ndarray) -> np.ndarray:
+    return -4e5 * np.square(np.square(s - 0.5) - 1e-4)
 
-        def margin(self, found: Measured, _: np.ndarray) -> float:
-            return float(found.share.max())
 
-    sampled = float(Survey.measured[0].share.max())
-    found = [sampled, *(margin for _, margin in judge_module.look_at_peaks(Survey()))]
-    assert max(found) == pytest.approx(top, abs=1e-2)
-    assert (max(found) > 1) == (top > 1)
-    assert sum(len(s) for s in asked) < 60
+@pytest.mark.parametrize("by", [1e-5, -1e-5])
+@pytest.mark.parametrize("shape", [_rises_slowly_and_falls_fast, _begins_near_its_top, _has_two_tops_in_one_interval])
+def test_tops_that_are_no_parabolas_between_three_samples_decide_as_any_other(
+    shape: Callable[[np.ndarray], np.ndarray], by: float
+) -> None:
+    top = shape(np.linspace(0, 1, 10_000_001)).max()
+    survey = OfOneCondition(lambda s: 1 + 10 * (shape(s) - top) + by)
+    assert (survey.largest() > 1) == (by > 0)

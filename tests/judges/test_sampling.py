@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.judges.plans.sampling import AT_ENDS, CELLS, FEW_CELLS, FEWEST, LONGEST, sample, time_table
+from cnpgen.judges.plans.sampling import AT_ENDS, CELLS, FEW_CELLS, FEWEST, LONGEST, MOST, sample, time_table
 from cnpgen.trajectory.motion import Motion
 from tests.examples.plans import load
 
@@ -37,13 +37,14 @@ def test_times_are_right_where_the_rate_begins_at_almost_nothing():
     assert phases[-1] == 1
 
 
-def test_a_motion_that_would_take_too_many_samples_is_not_sampled():
-    rate = np.full(20, 1.0 / (1e-3 * LONGEST))
-    assert sample(time_table(0.99 * rate, 7), 1e-3, 13) is None
-    some = sample(time_table(1.01 * rate, 7), 1e-3, 13)
-    assert some is not None
-    assert LONGEST < len(some.s) < 1.1 * LONGEST
-    assert sample(time_table(0.99 * rate, 7), 2e-3, 13) is not None
+@pytest.mark.parametrize("step", [1e-2, 1e-3, 1e-5])
+def test_whether_a_motion_is_too_long_does_not_depend_on_the_step(step: float) -> None:
+    rate = np.full(20, 1.0 / LONGEST)
+    assert sample(time_table(0.99 * rate, 7), step, 13) is None
+    slow = sample(time_table(1.01 * rate, 7), step, 13)
+    assert slow is not None
+    assert MOST < len(slow.s) < 1.1 * MOST
+    assert np.diff(slow.t).max() <= 1e-2
 
 
 def test_a_coarser_step_takes_fewer_samples():

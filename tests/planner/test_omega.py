@@ -105,6 +105,15 @@ def test_a_gradient_that_is_nan_itself_is_not_hidden(omegas: dict[str, Omega]) -
     assert np.isnan(by_phi[1]).any()
 
 
+@pytest.mark.parametrize("problem", [GIVEN, *some(PROBLEMS, 1, "slow")])
+def test_of_no_task_there_are_no_control_points_and_no_gradients(omegas: dict[str, Omega], problem: str) -> None:
+    omega = omegas[problem]
+    tasks, given = omega.tasks(asked_of(omega, 1)[:0]), [values[:0] for values in outputs(omega, 1)]
+    points = omega(tasks, *given)
+    found = omega.pull_back(tasks, *given, path_gradient=points.path, rate_gradient=points.rate)
+    assert [values.shape for values in found] == [values.shape for values in given]
+
+
 def test_plans_are_of_the_same_control_points_and_tasks(cache_folder: Path) -> None:
     omega = Omega("heavy-object", bending_steps=0, landing_steps=0, backend="numpy", cache_folder=cache_folder)
     given = boundary("heavy-object", 3)

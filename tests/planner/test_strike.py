@@ -86,6 +86,7 @@ def test_a_planner_that_has_struck_can_still_be_pickled(planner, state):
         (((np.zeros(6),) * 3, [1.0], TARGET), r"puck must have shape \(2,\) or \(N, 2\) or \(3,\) or \(N, 3\), got"),
         (((np.zeros(6),) * 3, [1.0, np.nan], TARGET), "puck must be finite"),
         (((np.zeros((2, 6)),) * 3, np.ones((3, 2)), TARGET), "start_q is given for 2 strikes, something else for 3"),
+        (((np.zeros((0, 6)),) * 3, np.ones((0, 2)), TARGET), "start_q is of no strike"),
     ],
 )
 def test_what_makes_no_sense_is_refused_by_name(planner, arguments, message):

@@ -9,6 +9,7 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.refine.engine import tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.passes import Pass
 from cnpgen.refine.polish import refine_task
@@ -103,6 +104,34 @@ def test_where_a_given_plan_leads_all_attempts_astray_one_is_made_from_nothing(m
     assert begun[0] is False
     assert found.valid
     assert found.outcome is Outcome.RESTARTED
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [
+        [
+            [0.0186, 1.4355, -1.05, -1.2516, -0.8038, 0.7892, -2.4982],
+            [-0.1777, 1.892, 1.647, -1.4845, -0.5815, 0.1759, 0.2585],
+        ],
+        pytest.param(
+            [
+                [-0.6113, 1.1158, -0.1419, -0.6555, -1.3717, 1.9079, -2.9349],
+                [-0.7075, 1.1233, 1.3434, -1.91, 0.8258, 0.6802, -0.5628],
+            ],
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_transport_that_no_start_solves_is_solved_by_going_on_from_the_best_attempt(ends: list[list[float]]) -> None:
+    start, goal, rest = np.array(ends[:1]), np.array(ends[1:]), np.zeros((1, 7))
+    plans = cnpgen.make_plans(
+        "heavy-object",
+        cnpgen.Boundary(start, rest, rest, goal, rest),
+        path_control_points=np.full((1, 15, 7), np.nan),
+        rate_control_points=np.ones((1, 20)),
+    )
+    jury = Jury(PROBLEMS["heavy-object"], ROBOTS["heavy-object"], degree=7)
+    assert refine_task(refiner("heavy-object"), jury, *tasks_of(plans)).valid
 
 
 @needs_robots

@@ -12,7 +12,8 @@ from cnpgen.trajectory.spline import basis
 Array = NDArray[np.float64]
 
 FEWEST = 200  # samples of a motion
-LONGEST = 200_000  # time steps that a motion may take: three minutes at 1 ms, which take a second to look at
+LONGEST = 2000.0  # s that a motion may take, whatever the step: half an hour
+MOST = 200_000  # samples in time, which take a second to look at: of longer motions they are further apart
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
 CELLS, FEW_CELLS = 4096, 512  # of equal size in the table of times, and in that of a first look
 PER_SPAN = 8  # samples between two knots, evenly in phase
@@ -67,7 +68,7 @@ def sample(
 ) -> Samples | None:
     """Choose samples that are at most ``step`` apart and see everything that a B-spline can do.
 
-    * Times, at least ``FEWEST``, no more than ``step`` apart.
+    * Times, at least ``FEWEST``, no more than ``step`` apart, but not above ``MOST``.
     * Phases, ``PER_SPAN`` in every span: a large r could leap over a part of the path between two time steps.
     * ``AT_ENDS`` phases near each end, spaced quadratically from 1e-5 on: the basis functions that are clamped there
       are about 0.01 wide, and what they hide between the time steps of a fast motion is found here.
@@ -80,13 +81,13 @@ def sample(
         sparse: Whether ``SPARSE`` times fewer in time are enough, half of them in every span, and all near the ends.
 
     Returns:
-        The samples, or None if the motion takes longer than ``LONGEST`` steps.
+        The samples, or None if the motion takes ``LONGEST`` or more.
     """
     duration = table[1, -1]
-    if not duration < step * LONGEST:
+    if not duration < LONGEST:
         return None
     fewer = SPARSE if sparse else 1
-    count = max(FEWEST // fewer, int(np.ceil(SPARE * duration / (fewer * step))) + 1)
+    count = max(FEWEST // fewer, min(MOST, int(np.ceil(SPARE * duration / (fewer * step))) + 1))
     by_time = np.interp(np.linspace(0, duration, count), table[1], table[0])
     near = END * np.linspace(0, 1, AT_ENDS + 1) ** 2
     evenly = np.linspace(0, 1, (PER_SPAN // 2 if sparse else PER_SPAN) * spans + 1)

@@ -40,9 +40,8 @@ def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[An
     if "path_control_points" not in columns:
         return PlanCheck()
     rows, spec = len(columns["start_q"]), problem.trajectory
-    motion = Motion(
-        columns["path_control_points"].reshape(rows, -1, robot.n), columns["rate_control_points"], spec.degree
-    )
+    path = columns["path_control_points"].reshape(rows, spec.path_control_points, robot.n)
+    motion = Motion(path, columns["rate_control_points"], spec.degree)
     boundary = Boundary.from_batch(columns, None)
     verdicts = judge(problem, robot, motion, boundary, columns["start_xyz"], columns["goal_xyz"])
     wrong = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
