@@ -125,7 +125,8 @@ class Refiner:
             yield other
             best = other if other.is_better(best) else best
         even = self._slow_enough(task, starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
-        if given is not None or not np.array_equal(even, self.straight(task)):  # what all of these began with may have led them astray
+        # what all of these began with may have led them astray
+        if given is not None or not np.array_equal(even, self.straight(task)):
             for attempt in self._passes(task, None, None, even):
                 yield replace(attempt, outcome=Outcome.RESTARTED)
         if task.until == np.inf and keeps_clear(self.problem, self.robot):
