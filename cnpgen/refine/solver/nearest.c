@@ -167,8 +167,10 @@ static void survey(const polyhedron *p, working *set, const double *x, double fe
     EACH(i, first, first + B < p->count ? first + B : p->count) {
       double by = excess(p, i, r[i - first]);
       if (!(by > least)) continue;
-      long k = set->broken < B ? set->broken++ : 0;
-      if (k == 0 && set->broken == B) EACH(l, 1, B) if (worst[l] < worst[k]) k = l;
+      long k = 0;
+      if (set->broken < B) worst[k = set->broken++] = 0;
+      else EACH(l, 1, B) if (worst[l] < worst[k]) k = l;
+      if (worst[k] > by) continue;
       worst[k] = by, set->number[k] = i;
       if (by > most) most = by, least = most * SERIOUS > feasible ? most * SERIOUS : feasible;
     }
@@ -245,9 +247,11 @@ static int nearest(const polyhedron *p, const double *f, const int *first, long 
     settle(p, set, f, x);
     survey(p, set, x, feasible);
     if (!set->broken) return 1;
-    for (; set->broken; survey(p, set, x, feasible))
-      for (long k; (k = broken(p, set, x, feasible, &value)) >= 0;)
+    for (int moved = 1; set->broken && moved; survey(p, set, x, feasible)) { /* rounding may say otherwise below */
+      moved = 0;
+      for (long k; (k = broken(p, set, x, feasible, &value)) >= 0; moved = 1)
         if (!repair(p, set, x, k, value, &changes)) return 0;
+    }
   }
   return 1;
 }
