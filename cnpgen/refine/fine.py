@@ -78,6 +78,8 @@ class FineCheck:
         worst = float(ratio.max())
         if not np.isfinite(worst):
             return cost, Excess(np.inf, True, np.inf)
+        if worst <= 1:
+            return cost, Excess(worst, False, 1.0)
         high = ratio > 1
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.where(high, g / np.where(g > bounds.upper, bounds.upper, bounds.lower), 0.0).max(axis=0)

@@ -118,15 +118,15 @@ class Refiner:
             yield self._slowed_only(task, given)
             return
         repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
-        line = self.straight(task)
-        best = yield from self._passes(task, given, repaired, line)
+        best = yield from self._passes(task, given, repaired)
         if self.check.refutes_ends(task):
             return
         for other in self._from_others(task, given if repaired is None else repaired.x, best):
             yield other
             best = other if other.is_better(best) else best
         even = self._slow_enough(task, starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
-        if given is not None or not np.array_equal(even, line):  # what all of these began with may have led them astray
+        # what all of these began with may have led them astray
+        if given is not None or not np.array_equal(even, self.straight(task)):
             for attempt in self._passes(task, None, None, even):
                 yield replace(attempt, outcome=Outcome.RESTARTED)
                 best = attempt if attempt.is_better(best) else best
@@ -137,7 +137,7 @@ class Refiner:
             yield from self._around(task, best)
 
     def _passes(
-        self, task: Task, given: Array | None, repaired: Attempt | None, line: Array
+        self, task: Task, given: Array | None, repaired: Attempt | None, line: Array | None = None
     ) -> Generator[Attempt, None, Attempt]:
         """Yield the plans of the three passes, from a given one or from nothing; return the best one.
 
@@ -145,16 +145,17 @@ class Refiner:
             task: What to plan.
             given: Variables of the given plan.
             repaired: The given plan with exact ends, slowed down, where that may be: where passes begin.
-            line: Where they begin where there is no plan, or one that is far off.
+            line: Where they begin where there is no plan, or one that is far off; the straight line by default.
         """
         first = self._first(task, given if repaired is None else repaired.x, line)
         outcome = Outcome.SOLVED if first.ended else Outcome.UNSETTLED
-        if first.violation <= self.settings.violation_tolerance and not task.at_rest:
+        feasible = first.violation <= self.settings.violation_tolerance
+        if feasible:
             cost = first.cost - self.check.transcription(task).gauge(first.x)
             yield Attempt(first.x, 0.0, cost, outcome, first.iterations)  # most are valid; no need to measure
-            best = self._measured(task, first.x, Outcome.SOLVED)
-        else:
-            best = self._iterated_on(task, self._measured(task, first.x, outcome, first.iterations))
+        best = self._measured(task, first.x, outcome, 0 if feasible else first.iterations)
+        best = self._iterated_on(task, best)
+        if not feasible or best.x is not first.x:
             yield best
         polished = self._attempt(task, self.passes.polish, best.x, Outcome.POLISHED)
         yield polished
@@ -263,13 +264,13 @@ class Refiner:
         """Return the variables of the straight line, where the first pass begins."""
         return self._slow_enough(task, starts.gentle(task.boundary, self.robot.velocity_limit, self.spec))
 
-    def _first(self, task: Task, x: Array | None, line: Array) -> Result:
+    def _first(self, task: Task, x: Array | None, line: Array | None) -> Result:
         """Run the first pass from variables, or from a line where there are none, or far off."""
         if x is not None:
             result = self.minimise(task, self.passes.given, x)
             if result.violation < FAR:
                 return result
-        return self.minimise(task, self.passes.first, line)
+        return self.minimise(task, self.passes.first, self.straight(task) if line is None else line)
 
     def _attempt(self, task: Task, which: Pass, x: Array, outcome: Outcome, hulls: Hulls | None = None) -> Attempt:
         result = self.minimise(task, which, x, hulls)

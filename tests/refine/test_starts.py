@@ -9,8 +9,10 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.make.boundary_problems import draw_boundary_problems
-from cnpgen.refine.engine import tasks_of
+from cnpgen.planner.planner import Planner
+from cnpgen.refine.engine import prepare, tasks_of
 from cnpgen.refine.jury import Jury
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.passes import Pass
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
@@ -80,6 +82,16 @@ def test_a_pass_that_is_stuck_where_breaking_limits_pays_goes_on_with_heavier_vi
     assert result.iterations > 2
     assert penalties[0] == sqp.Settings().penalty
     assert penalties[-1] > sqp.HEAVY
+
+
+def test_a_pass_does_not_give_up_since_its_start_violated_less_than_what_it_leads_to() -> None:
+    problems = draw_boundary_problems("airhockey-replan", 96, seed=20266)
+    plans = Planner("airhockey-replan").plan_batch(problems.boundary)
+    tool = prepare(plans, RefineOptions())
+    for given in (tasks_of(plans)[row] for row in (22, 37, 53)):
+        x = tool.given(given)
+        assert x is not None
+        assert tool.minimise(given, tool.passes.given, x).violation < sqp.DEFAULT.violation_tolerance
 
 
 def test_where_a_given_plan_leads_all_attempts_astray_one_is_made_from_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -185,16 +185,17 @@ class CompiledSteps:
         spec, n, nx, size = motion.spec, motion.n, motion.nx, self._m * self._points
         width, nodes = motion.stage.values.tape.inputs[0], len(motion.grid.criterion_weights)
         count = 0 if motion.stage.residuals is None else motion.stage.residuals.tape.outputs[0]
-        criterion = nodes * ((4 * n + 3) * (count + 1) + count) + (count + 1) * stride
+        criterion = nodes * ((4 * n + 3) * (count + 1) + (2 + stride) * count) + stride
+        duration = len(motion.grid.weights) * (spec.rate_control_points + WIDEST) + stride
         sizes = {
             "control": spec.path_control_points * n,
             "rates": spec.rate_control_points,
-            "slope": 6 * n,
+            "slope": 6 * (n + WIDEST),
             "w": width * self._points,
             "gradient": nx,
-            "hessian": nx * stride,
+            "hessian": nx * stride + BLOCK,
             "factor": nx * stride,
-            "scratch": max(size + (width + 1) * self._m * TILE + stride, criterion) + WIDEST,
+            "scratch": max(size + (width + 1) * self._m * TILE + stride, criterion, duration) + BLOCK,
             "where": size,
             "first": size,
         }
@@ -203,7 +204,8 @@ class CompiledSteps:
     def _programme(self, stride: int) -> _Polyhedron:
         dim = self._nx + 1
         rows = dim + self._m * self._points + BLOCK
-        sizes = (rows * dim, rows, rows, rows, (2 * dim + 8) * stride, dim)  # rows, low, high, norm, scratch, active
+        scratch = (2 * dim + BLOCK) * stride + 8 * (stride + BLOCK)
+        sizes = (rows * dim, rows, rows, rows, scratch, dim)  # rows, low, high, norm, scratch, active
         return _Polyhedron(dim, stride, 0, *(self._keep(_aligned(size)) for size in sizes))
 
     def _bases(self, bases: Bases) -> _Bases:

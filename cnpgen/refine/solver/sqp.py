@@ -139,10 +139,11 @@ class _Descent:
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
         self._steps = steps_of(motion, bounds, settings.thin)
-        self.x = x
+        self.x = self._start = x
         self.cost, self._g, self.violation = self._steps.value(x)
         self.ended = not self.violation < settings.far
-        self._violations = [self.violation]
+        # since the start was left, which may violate less than what it leads to, and is only told where it is feasible
+        self._violations = [self.violation] if self.violation <= settings.violation_tolerance else []
         self._bounds, self._settings = bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_SHARE
@@ -168,7 +169,8 @@ class _Descent:
             self._radius *= 0.25
         else:
             self._try(step, model.held)
-        self._violations.append(self.violation)
+        if self.x is not self._start:
+            self._violations.append(self.violation)
         if self._is_stuck() and self._penalty < self.cost:  # breaking its limits may pay: it will not
             self._penalty, self._violations = HEAVY * self.cost, [self.violation]
         self.ended |= self._radius < SMALLEST or self._is_stuck()

@@ -25,7 +25,7 @@ typedef struct {
   const double *smooth;                 /* (R, R) */
   const double *lower, *upper;          /* (m, K) */
   const unsigned char *sharp;           /* (m, K) */
-  double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, n), (width, K) */
+  double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, padded n) with zeros, (width, K) */
   double *gradient, *hessian, *factor;  /* (nx,); above and below the diagonal, (nx, stride) each */
   double *scratch;
   int *where, *first; /* row nx + 1 + j is of residual i at point k: where[j] = i K + k; room for as many */
@@ -41,7 +41,9 @@ static void end(motion *s, const double *q, const double *dq, const double *ddq,
   long inner = last + step, edge = step > 0 ? 0 : s->path - 1;
   double r = s->rates[last], eta = s->eta;
   double rise = ddq ? s->rate_eta * (s->rates[inner] - r) : 0;
-  double *c = s->control + edge * s->n, *c1 = c + step * s->n, *c2 = c1 + step * s->n, *d = s->slope + s->slopes * s->n;
+  double *c = s->control + edge * s->n, *c1 = c + step * s->n, *c2 = c1 + step * s->n;
+  long wide = padded(s->n);
+  double *d = s->slope + s->slopes * wide;
   EACH(j, 0, s->n) {
     double v0 = sign * dq[j], first = v0 / r, d1 = -v0 / (r * r * eta);
     c[j] = q[j];
@@ -49,8 +51,8 @@ static void end(motion *s, const double *q, const double *dq, const double *ddq,
     d[j] = d1;
     if (ddq) {
       c2[j] = (ddq[j] - first * rise * r) / (r * r) / s->beta - 2 * q[j] + 3 * c1[j];
-      d[s->n + j] = (-2 * (ddq[j] - v0 * rise) / r + v0 * s->rate_eta) / (r * r) / s->beta + 3 * d1;
-      d[2 * s->n + j] = -v0 * s->rate_eta / (r * r * s->beta);
+      d[wide + j] = (-2 * (ddq[j] - v0 * rise) / r + v0 * s->rate_eta) / (r * r) / s->beta + 3 * d1;
+      d[2 * wide + j] = -v0 * s->rate_eta / (r * r * s->beta);
     }
   }
   EACH(i, 0, ddq ? 3 : 1) {
@@ -64,6 +66,7 @@ static void unpack(motion *s, const double *x) {
   EACH(i, 0, s->rate) s->rates[i] = exp(x[split + i]);
   memcpy(s->control + 3 * s->n, x, split * sizeof(double));
   s->slopes = 0;
+  memset(s->slope, 0, 6 * padded(s->n) * sizeof(double));
   end(s, s->start_q, s->start_dq, s->start_ddq, 1, 0, 1);
   end(s, s->goal_q, s->goal_dq, s->goal_ddq, -1, s->rate - 1, -1);
 }
@@ -90,17 +93,13 @@ static void chain(const motion *s, const bases *b, long k, const double *J, doub
   long n = s->n, orders = b->orders, split = s->nx - s->rate, stride = padded(n);
   const double *path = b->path_at + k * s->path * orders, *rate = b->rate_at + k * s->rate * (orders - 1);
   double ends[6 * stride], *next = ends;
-  memset(row, 0, split * sizeof(double));
-  memset(ends, 0, sizeof ends);
   EACH(c, 0, s->path) {
-    int inside = c >= 3 && c < s->fixed, far = 1;
-    EACH(o, 0, orders) far &= path[c * orders + o] == 0;
+    int inside = c >= 3 && c < s->fixed;
     double *control = inside ? row + (c - 3) * n : next;
     if (!inside) next += stride;
-    if (far) { if (inside) EACH(j, 0, n) control[j] = 0; continue; }
     for (long j = 0; j < n; j += W) {
       v x = K(0);
-      EACH(o, 0, orders) x += K(path[c * orders + o]) * at(J + o * stride + j);
+      EACH(o, 0, orders) x += path[c * orders + o] * at(J + o * stride + j);
       put(control + j, x);
     }
   }
@@ -111,7 +110,25 @@ static void chain(const motion *s, const bases *b, long k, const double *J, doub
   }
   EACH(e, 0, s->slopes) {
     long c = s->point[e] < 3 ? s->point[e] : s->point[e] - s->fixed + 3;
-    row[split + s->variable[e]] += dot(ends + c * stride, s->slope + e * n, n) * s->rates[s->variable[e]];
+    double x = 0;
+    for (long j = 0; j < n; j += W) x += sum(at(ends + c * stride + j) * at(s->slope + e * stride + j));
+    row[split + s->variable[e]] += x * s->rates[s->variable[e]];
+  }
+}
+
+/* Add the products of rows with each other, of their first `size` numbers, to the upper triangle of a matrix. */
+static void gram(const double *rows, long stride, long count, long size, double *matrix, long wide) {
+  for (long j = 0; j < size; j += 4) for (long l = j / W * W; l < size; l += 2 * W) {
+    v x[4] = {K(0), K(0), K(0), K(0)}, y[4] = {K(0), K(0), K(0), K(0)};
+    EACH(i, 0, count) {
+      const double *row = rows + i * stride;
+      EACH(e, 0, 4) x[e] += row[j + e] * at(row + l), y[e] += row[j + e] * at(row + l + W);
+    }
+    EACH(e, 0, size - j < 4 ? size - j : 4) {
+      double sums[2 * W];
+      put(sums, x[e]), put(sums + W, y[e]);
+      add(matrix + (j + e) * wide + l, 1, sums, size - l < 2 * W ? size - l : 2 * W);
+    }
   }
 }
 
@@ -121,8 +138,8 @@ static double criterion(motion *s, int derivatives) {
   long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points;
   long nx = s->nx, stride = s->stride;
   double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points;
-  double *rows = jacobian + width * count * points;
-  double J[width + b->orders * W], scaled[count], cost = 0;
+  double *pull = jacobian + width * count * points, *rows = pull + count * points, *gradient = rows;
+  double J[width + b->orders * W], cost = 0;
   memset(J, 0, sizeof J);
   states(s, b, w);
   s->criterion(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
@@ -130,50 +147,50 @@ static double criterion(motion *s, int derivatives) {
     double squares = 0, r = w[b->orders * n * points + k], share = s->criterion_weights[k] / r;
     EACH(i, 0, count) squares += e[i * points + k] * e[i * points + k];
     double size = sqrt(squares + s->rounded * s->rounded);
-    double rho = s->rounded > 0 ? size - s->rounded : squares, slope = s->rounded > 0 ? 1 / size : 2;
+    double rho = s->rounded > 0 ? size - s->rounded : squares, root = sqrt(share * (s->rounded > 0 ? 1 / size : 2));
     cost += share * rho;
     if (!derivatives) continue;
     EACH(i, 0, s->rate)
       s->gradient[nx - s->rate + i] -= share * rho / r * b->rate_at[(k * s->rate + i) * (b->orders - 1)] * s->rates[i];
     EACH(i, 0, count) {
       gather(s, b->orders, jacobian, count, i, points, k, J);
-      chain(s, b, k, J, rows + i * stride);
-      add(s->gradient, share * slope * e[i * points + k], rows + i * stride, nx);
-    }
-    EACH(j, 0, nx) {
-      EACH(i, 0, count) scaled[i] = share * slope * rows[i * stride + j];
-      for (long l = j / W * W; l < nx; l += W) {
-        v x = at(s->hessian + j * stride + l);
-        EACH(i, 0, count) x += K(scaled[i]) * at(rows + i * stride + l);
-        put(s->hessian + j * stride + l, x);
-      }
+      for (long j = 0; j < b->orders * padded(n) + b->orders - 1; j++) J[j] *= root;
+      chain(s, b, k, J, gradient);
+      pull[k * count + i] = root * e[i * points + k];
+      gradient += stride;
     }
   }
+  if (!derivatives) return cost;
+  gram(rows, stride, count * points, nx, s->hessian, stride);
+  combine(rows, stride, count * points, pull, nx, gradient);
+  add(s->gradient, 1, gradient, nx);
   return cost;
 }
 
 /* The time and what fixes the gauge; their gradient and curvature are set where they are wanted. */
 static double duration(motion *s, const double *log, int derivatives) {
-  long nx = s->nx, split = nx - s->rate, stride = s->stride;
-  double cost = 0;
+  long nx = s->nx, split = nx - s->rate, stride = s->stride, wide = padded(s->rate);
+  double cost = 0, *pull = s->scratch, *rows = pull + s->gauss, *gradient = rows + s->gauss * wide;
   EACH(i, 0, s->rate) {
-    double pull = dot(s->smooth + i * s->rate, log, s->rate);
-    cost += 0.5 * log[i] * pull;
+    double slope = dot(s->smooth + i * s->rate, log, s->rate);
+    cost += 0.5 * log[i] * slope;
     if (!derivatives) continue;
-    s->gradient[split + i] = pull;
+    s->gradient[split + i] = slope;
     memcpy(s->hessian + (split + i) * stride + split, s->smooth + i * s->rate, s->rate * sizeof(double));
   }
   EACH(q, 0, s->gauss) {
     const double *basis = s->quadrature + q * s->rate;
-    double slope[s->rate], inverse = 1 / dot(basis, s->rates, s->rate), weight = s->weights[q] * inverse;
+    double inverse = 1 / dot(basis, s->rates, s->rate), weight = s->weights[q] * inverse;
     cost += weight;
     if (!derivatives) continue;
-    EACH(i, 0, s->rate) slope[i] = basis[i] * s->rates[i];
-    add(s->gradient + split, -weight * inverse, slope, s->rate);
-    EACH(i, 0, s->rate) if (slope[i] != 0)
-      add(s->hessian + (split + i) * stride + split + i, 2 * weight * inverse * inverse * slope[i], slope + i,
-          s->rate - i);
+    double root = inverse * sqrt(2 * weight);
+    EACH(i, 0, s->rate) rows[q * wide + i] = root * basis[i] * s->rates[i];
+    pull[q] = -weight * inverse / root;
   }
+  if (!derivatives) return cost;
+  gram(rows, wide, s->gauss, s->rate, s->hessian + split * stride + split, stride);
+  combine(rows, wide, s->gauss, pull, s->rate, gradient);
+  add(s->gradient + split, 1, gradient, s->rate);
   return cost;
 }
 
@@ -209,12 +226,13 @@ double look(motion *s, const double *x, double *g) {
 static int factor(motion *s, double proximal) {
   long nx = s->nx, stride = s->stride;
   EACH(k, 0, nx) {
-    double *row = s->hessian + k * stride, pivot = row[k] + proximal;
+    long from = k / W * W;
+    double *row = s->hessian + k * stride, *known = s->scratch;
+    combine(s->hessian + from, stride, k, s->factor + k * stride, nx - from, s->scratch);
+    double pivot = row[k] + proximal - known[k - from], scale = 1 / sqrt(pivot);
     if (!(pivot > 0)) return 0;
-    double scale = 1 / sqrt(pivot);
-    EACH(i, k + 1, nx) s->factor[i * stride + k] = row[i] *= scale;
+    EACH(i, k + 1, nx) s->factor[i * stride + k] = row[i] = scale * (row[i] - known[i - from]);
     s->factor[k * stride + k] = scale;
-    EACH(i, k + 1, nx) add(s->hessian + i * stride + i, -row[i], row + i, nx - i);
   }
   return 1;
 }
@@ -227,22 +245,30 @@ static void whiten(const motion *s, double *block, long from) {
     EACH(l, 0, 4) x[l] = at(block + i * B + l * W), y[l] = at(block + (i + 1) * B + l * W);
     EACH(j, from, i) EACH(l, 0, 4) {
       v above = at(block + j * B + l * W);
-      x[l] -= K(row[j]) * above;
-      y[l] -= K(other[j]) * above;
+      x[l] -= row[j] * above;
+      y[l] -= other[j] * above;
     }
     EACH(l, 0, 4) {
-      put(block + i * B + l * W, x[l] *= K(row[i]));
-      if (other != row) put(block + (i + 1) * B + l * W, (y[l] - K(other[i]) * x[l]) * K(other[i + 1]));
+      put(block + i * B + l * W, x[l] *= row[i]);
+      if (other != row) put(block + (i + 1) * B + l * W, (y[l] - other[i] * x[l]) * other[i + 1]);
     }
   }
 }
 
-/* Mark crests along the motion, what is beside them, and the thin grid. */
-static void crest(const motion *s, const double *excess, unsigned char *wide) {
-  long last = s->grid.points - 1;
-  EACH(k, 0, last + 1) wide[k] = k % s->thin == 0;
-  EACH(k, 0, last + 1) if ((k == 0 || excess[k] >= excess[k - 1]) && (k == last || excess[k] >= excess[k + 1]))
-    EACH(near, k > 0 ? k - 1 : 0, k < last ? k + 2 : k + 1) wide[near] = 1;
+/* Mark crests along the motion, what is beside them, and the thin grid, where they are nearer than `near`. */
+static void crest(const motion *s, const double *excess, double near, unsigned char *wide) {
+  long points = s->grid.points;
+  unsigned char peak[points + 2];
+  double most = -INFINITY;
+  EACH(k, 0, points) most = excess[k] > most ? excess[k] : most;
+  memset(wide, 0, points);
+  if (!(most > -near)) return;
+  memset(peak, 1, points + 2);
+  EACH(k, 1, points) peak[k + 1] = excess[k] >= excess[k - 1];
+  EACH(k, 0, points - 1) peak[k + 1] &= excess[k] >= excess[k + 1];
+  peak[0] = peak[points + 1] = 0;
+  EACH(k, 0, points) wide[k] = (peak[k] | peak[k + 1] | peak[k + 2]) & (excess[k] > -near);
+  for (long k = 0; k < points; k += s->thin) wide[k] = excess[k] > -near;
 }
 
 static double leap(const motion *s, long k, const double *J, double step) {
@@ -278,9 +304,9 @@ void model(motion *s, const double *x, const double *g, double proximal, double 
   double *row = jacobian + width * m * TILE, J[width + s->grid.orders * W];
   memset(J, 0, sizeof J);
   EACH(i, 0, m * points) excess[i] = outside(s, g, i);
-  EACH(i, 0, m) crest(s, excess + i * points, held + i * points);
-  EACH(i, 0, m * points)
-    held[i] = (held[i] && excess[i] > -near) || missed[i] || (multipliers && multipliers[i] != 0);
+  EACH(i, 0, m) crest(s, excess + i * points, near, held + i * points);
+  EACH(i, 0, m * points) held[i] |= missed[i];
+  if (multipliers) EACH(i, 0, m * points) held[i] |= multipliers[i] != 0;
 
   long count = nx + 1;
   memset(p->rows, 0, (count + B) / B * count * B * sizeof(double));
@@ -330,7 +356,7 @@ may use if `relax`. `before` are multipliers, (m, K), of rows to be active at fi
 int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
           double least, double feasible, int changes, double *dx, double *multipliers) {
   long nx = s->nx, dim = nx + 1, stride = s->stride, count = 0;
-  double f[dim], x[dim];
+  double f[dim], x[stride];
   if (!s->programme.count) return 0;
   bound(s, g, box, softness, relax);
   EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * stride, f, i)) * s->factor[i * stride + i];
