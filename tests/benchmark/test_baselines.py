@@ -141,7 +141,7 @@ def test_aqp_plans_hits_only() -> None:
         AQP().prepare(Setting(one_of("heavy-100").problem))
 
 
-@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
+@pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 0, "slow"))
 def test_the_paths_of_cbirrt_stay_on_the_manifold_and_are_timed_by_the_velocity_limits(suite: str) -> None:
     """In a process of its own, as in a benchmark: OMPL tells of leaks when its process ends."""
     pytest.importorskip("ompl")

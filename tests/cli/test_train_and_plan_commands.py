@@ -79,13 +79,14 @@ def test_a_run_that_was_killed_before_its_picture_was_drawn_draws_it_when_it_is_
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("often", some([0, 100], 1, "slow"))
+@pytest.mark.parametrize("often", some([0, 100], 0, "slow"))
 def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):
     monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]) == 0
     assert ("a planner from more rows is better" in capsys.readouterr().err) == (often == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_batches_of_more_rows_than_there_are_are_spoken_of(tiny, tmp_path, capsys):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]
@@ -98,6 +99,7 @@ def test_batches_of_more_rows_than_there_are_are_spoken_of(tiny, tmp_path, capsy
     assert "every step takes all" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_checkpoint_of_another_run_is_a_wrong_argument(tiny, tmp_path, capsys, monkeypatch):
     words = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]
@@ -110,6 +112,7 @@ def test_the_checkpoint_of_another_run_is_a_wrong_argument(tiny, tmp_path, capsy
     assert "is of another run, it differs in settings.seed (0, now 3)" in text
 
 
+@pytest.mark.slow
 def test_a_finished_model_is_not_trained_again(trained, tiny, capsys):
     words, before = ["train", str(tiny("airhockey-hit")), "-o", str(trained)], trained.read_bytes()
     assert main([*words, *SMALL]) == 0
@@ -168,6 +171,7 @@ def test_an_interrupted_training_says_that_the_same_command_goes_on(tiny, tmp_pa
     assert (tmp_path / "m.checkpoint").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_the_command_in_a_model_is_the_one_that_was_given(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tiny("airhockey-hit"))

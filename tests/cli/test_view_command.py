@@ -26,7 +26,7 @@ from cnpgen.cli.view.bodies import robot_bodies, tube, wrapped
 from cnpgen.cli.view.serve import stamp
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
-from tests.conftest import HANGING
+from tests.conftest import HANGING, some
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load
 from tests.examples.shaped_robot import WEDGE, write_problem
@@ -177,7 +177,7 @@ def test_visual_meshes_are_shown_where_they_are_found(tmp_path):
     np.testing.assert_allclose(body.corners.max(axis=0), WEDGE.max(axis=0) / 1000 + [0.1, 0, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["meshes/none.stl", "meshes/broken.stl"])
+@pytest.mark.parametrize("name", some(["meshes/none.stl", "meshes/broken.stl"], 1, "slow"))
 def test_without_its_meshes_a_robot_is_shown_as_judges_see_it(name, tmp_path):
     problem = load_problem(_with_visual(tmp_path, name))
     (tmp_path / "crane" / "meshes" / "broken.stl").write_bytes(b"no mesh")
@@ -285,6 +285,7 @@ def got(address: str, **headers: str) -> tuple[int, dict[str, str], str]:
         return error.code, dict(error.headers), error.read().decode()
 
 
+@pytest.mark.slow
 @needs_meshcat
 def test_a_page_is_served_to_this_machine_and_follows_its_files(plans, tmp_path):
     file = tmp_path / "plans.h5"

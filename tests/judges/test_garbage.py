@@ -9,6 +9,7 @@ import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Reason, judge, summarise
+from tests.conftest import some
 from tests.examples.plans import Plan, bent, joined, load
 
 
@@ -61,7 +62,7 @@ def test_garbage_gets_an_honest_verdict(name, label):
         assert not verdict.paper.finished
 
 
-@pytest.mark.parametrize("label", ["replan", "transport"])
+@pytest.mark.parametrize("label", some(["replan", "transport"], 1, "slow"))
 def test_garbage_changes_nothing_about_the_other_plans(label):
     good = load(label)
     plans = [good]

@@ -183,7 +183,7 @@ def test_obstacles_are_drawn_where_the_task_has_them_and_the_title_says_what_it_
 @pytest.mark.parametrize(
     ("label", "by"),
     [
-        *some([("hit", 1.0), ("transport", 1e3), ("hit", 1e150)], 1, "slow"),
+        *some([("hit", 1.0), ("transport", 1e3), ("hit", 1e150)], 0, "slow"),
         *(pytest.param(*each, marks=again) for each in (("transport", 1.0), ("hit", 1e3), ("transport", 1e150))),
     ],
 )

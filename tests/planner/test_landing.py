@@ -45,7 +45,7 @@ def drawn(tiny, name: str, count: int, fixed: int) -> Boundary:
     return boundary if fixed == 2 else accelerated(boundary)
 
 
-@pytest.mark.parametrize("fixed", [2, 3])
+@pytest.mark.parametrize("fixed", some([2, 3], 1, "slow"))
 def test_a_plan_near_the_table_is_on_it_behind_the_landing(tiny, fixed):
     path, tops = nearby(tiny, "airhockey", fixed=fixed)
     before, after = heights(path), heights(landing_of("airhockey", fixed).land(path, tops))
@@ -74,6 +74,7 @@ def test_boundary_control_points_stay_and_the_given_path_is_not_changed(tiny, na
     assert landing_of(name, fixed).land(path.astype(np.float32), tops).dtype == np.float32
 
 
+@pytest.mark.slow
 def test_a_landing_within_the_joint_limits_ends_on_them_at_most_and_its_gradients_are_exact(tiny):
     path, tops = nearby(tiny, "airhockey")
     given = interpreted(surroundings_of("airhockey"))

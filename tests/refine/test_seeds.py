@@ -84,6 +84,7 @@ def test_a_motion_along_a_way_keeps_its_ends(wall):
     assert (np.abs(states.dq) < 1.5 * robot.velocity_limit).all()
 
 
+@pytest.mark.slow
 def test_an_arm_swings_over_a_wall_that_no_other_start_leads_over(wall, monkeypatch):
     robot, tool, task = load_robot(wall), refiner(wall), between(wall, BESIDE_WALL)
     jury = Jury(wall, robot, degree=tool.spec.degree)
