@@ -10,7 +10,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -43,7 +43,10 @@ def _has_meshcat() -> bool:
     return True
 
 
-needs_meshcat = pytest.mark.skipif(not _has_meshcat(), reason="MeshCat is not installed")
+def needs_meshcat(test: Callable[..., None]) -> Callable[..., None]:
+    """Mark a test of pages: they are in the slow run, as MeshCat brings two dozen packages that nothing else needs."""
+    skipped = pytest.mark.skipif(not _has_meshcat(), reason="MeshCat is not installed")
+    return pytest.mark.slow(skipped(test))
 
 
 def content(page: Path) -> dict[str, Any]:
@@ -285,7 +288,6 @@ def got(address: str, **headers: str) -> tuple[int, dict[str, str], str]:
         return error.code, dict(error.headers), error.read().decode()
 
 
-@pytest.mark.slow
 @needs_meshcat
 def test_a_page_is_served_to_this_machine_and_follows_its_files(plans, tmp_path):
     file = tmp_path / "plans.h5"
@@ -314,7 +316,6 @@ def test_a_change_beside_a_recipe_is_seen(tmp_path):
     assert stamp([file]) != before
 
 
-@pytest.mark.slow
 @needs_meshcat
 @needs_chromium
 def test_a_browser_runs_the_page_that_is_served(plans):
@@ -356,7 +357,6 @@ def test_a_browser_runs_the_page(page):
     assert found.count("<canvas") == 5  # the scene, and four curves
 
 
-@pytest.mark.slow
 @needs_meshcat
 @needs_chromium
 def test_a_browser_draws_the_arm_its_start_and_its_goal(page):

@@ -103,7 +103,7 @@ def fast(tiny):
     given = surroundings_of("heavy-object")
     boundary = boundary_of_columns(columns_of(tiny("heavy-object")), 12)
     ends = {f"{end}_xyz": columns_of(tiny("heavy-object"))[f"{end}_xyz"][:12] for end in ("start", "goal")}
-    kit = make_kit(given, meaning_of(1, 0), slow_down=True)
+    kit = make_kit(interpreted(given), meaning_of(1, 0), slow_down=False)
     path = bent_paths(tiny, "heavy-object", "heavy-object", 1)
     tasks = kit.prepare(boundary)
     shape = 0.4 + np.sin(np.pi * np.linspace(0, 1, 20))  # slow at the ends

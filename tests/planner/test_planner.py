@@ -134,7 +134,7 @@ def test_start_and_goal_are_asked_for_first_and_velocities_by_keyword(planner, r
 def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(tiny):
     """A plan's own start and end are off zero by 1e-14: replan(plan, 0) and chains of plans must not fail by it."""
     rest = boundary_of_columns(columns_of(tiny("heavy-object")), 20)
-    planner = Planner(untrained_model("heavy-object", rest))
+    planner = Planner(untrained_model("heavy-object", rest), backend="numpy")
     plans = planned(planner, rest)
     assert np.abs(states_at(plans, 0.0)[2]).max() > 0
     again = planner.replan(plans, 0.0, goal_q=rest.goal_q)
