@@ -91,6 +91,7 @@ print(version("cnpgen"), len(cnpgen.list_recipes("dataset")))
 """
 
 
+@pytest.mark.slow
 def test_what_the_wheel_installs_works_by_itself(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     """Unpacked elsewhere, away from the repository: names, recipes, version, script."""
     site, home = tmp_path / "site", tmp_path / "home"

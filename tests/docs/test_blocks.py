@@ -3,7 +3,6 @@
 import configparser
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.cli.main import main
 from cnpgen.make.dataset import make_dataset
 from cnpgen.problems.load import load_problem
 from cnpgen.problems.robot import load_robot
@@ -82,19 +80,6 @@ def shown(page: Path) -> Iterator[tuple[dict[str, str], str, str]]:
         if "install" in marks or "test" in marks:
             continue  # .ci/run runs these two in fresh environments
         yield marks, language, text
-
-
-def test_what_the_readme_shows_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In this process: most of what the README takes in a shell, which is in the slow run, is starting others."""
-    monkeypatch.chdir(tmp_path)
-    for _, language, text in shown(README):
-        if language == "python":
-            exec(compile(text, README.name, "exec"), {"__name__": "__main__"})
-        for line in text.splitlines() if language == "bash" else ():
-            command, _, otherwise = line.partition(" || ")
-            program, *words = shlex.split(command, comments=True)
-            assert program == "cnpgen"
-            assert main(words) in ({0, 1} if otherwise else {0}), line
 
 
 @pytest.mark.slow

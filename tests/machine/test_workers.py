@@ -44,6 +44,7 @@ def test_every_task_is_done_and_results_come_in_their_order_if_asked(workers, or
     assert found == [0, 1, 2] if ordered or workers == 1 else sorted(found) == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_tasks_are_fetched_as_they_are_needed():
     fetched = []
 

@@ -24,6 +24,8 @@ from cnpgen.training.train import train_model
 from tests.conftest import columns_of, tiny_recipe
 from tests.examples.models import SMALL, accelerated, boundary_of_columns, untrained_model
 
+pytestmark = pytest.mark.slow  # rows, training and kernels that no other test needs
+
 Tiny = Callable[[str], Path]
 
 
@@ -70,7 +72,6 @@ def test_what_is_not_said_is_no_acceleration(planner: Planner, rows: Path, tmp_p
     np.testing.assert_array_equal(read_file(tmp_path / "a.h5", planner.model).boundary.goal_ddq, q.goal_ddq)
 
 
-@pytest.mark.slow
 def test_a_model_of_motions_at_rest_takes_no_other_acceleration(tiny: Tiny) -> None:
     boundary = boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
     still = accelerated(replace(boundary, goal_dq=0 * boundary.goal_dq), 0.0)

@@ -60,6 +60,7 @@ def test_positions_that_are_no_numbers_have_no_distances(tmp_path):
     assert np.isnan(Hulls(problem, robot).near(q, place_obstacles(problem.obstacle))[0]).all()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_where_an_end_is_inside_an_obstacle_nothing_is_tried(tmp_path):
     problem = narrow(tmp_path, SLOT)
@@ -76,6 +77,7 @@ def test_robots_without_a_shape_have_no_hulls(tmp_path):
     assert not keeps_clear(bare, load_robot(bare))
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_path):
     problem = narrow(tmp_path, SLOT)

@@ -185,6 +185,7 @@ def test_derivatives_of_the_tip_are_those_of_finite_differences_and_within_the_r
     assert (np.linalg.norm(tip.jacobian, axis=0) <= arm.reach + 1e-12).all()
 
 
+@pytest.mark.slow
 def test_a_tip_that_cannot_stop_before_the_edge_is_proven_to_leave_the_table() -> None:
     finding = explain_case(at_the_edge(clearance=0.01, speed=1.5))
     assert finding.kind is Feasibility.INFEASIBLE

@@ -51,7 +51,7 @@ def test_the_gradient_of_network_boundary_and_loss_together_is_that_of_finite_di
             assert expected == pytest.approx(found, rel=2e-5, abs=1e-7 * np.linalg.norm(gradient)), names[active]
 
 
-@pytest.mark.parametrize("fixed", some([3, 2], 1, "slow"))
+@pytest.mark.parametrize("fixed", some([3, 2], 0, "slow"))
 def test_single_parameters_agree_as_well(tiny, fixed):
     learner, rows, parameters = prepared(tiny, "airhockey-replan", fixed=fixed)
     weights, gradient = np.ones(5), np.empty_like(parameters)

@@ -69,6 +69,7 @@ def test_a_motion_of_the_family_is_found_again(seed: int) -> None:
     assert largest_error(found, np.r_[0, between], np.vstack([q[:1], truth])) < 5e-5
 
 
+@pytest.mark.slow
 def test_a_trapezoidal_profile_is_followed_within_a_milliradian() -> None:
     t = np.linspace(0, 0.8, 801)
     q = trapezoid(t / 0.8)
