@@ -127,14 +127,19 @@ class Refiner:
         even = self._slow_enough(task, starts.straight(task.boundary, self.robot.velocity_limit, self.spec))
         # what all of these began with may have led them astray
         if given is not None or not np.array_equal(even, self.straight(task)):
-            for attempt in self._passes(task, None, None, even):
-                yield replace(attempt, outcome=Outcome.RESTARTED)
-                best = attempt if attempt.is_better(best) else best
-        for attempt in self._passes(task, best.x, None, even):
-            yield replace(attempt, outcome=Outcome.RESTARTED)
-            best = attempt if attempt.is_better(best) else best
+            best = yield from self._restarted(task, None, even, best)
+        best = yield from self._restarted(task, best.x, even, best)
         if task.until == np.inf and keeps_clear(self.problem, self.robot):
             yield from self._around(task, best)
+
+    def _restarted(
+        self, task: Task, given: Array | None, line: Array, best: Attempt
+    ) -> Generator[Attempt, None, Attempt]:
+        """Yield the plans of the three passes from another start; return the best attempt of these and ``best``."""
+        for attempt in self._passes(task, given, None, line):
+            yield replace(attempt, outcome=Outcome.RESTARTED)
+            best = attempt if attempt.is_better(best) else best
+        return best
 
     def _passes(
         self, task: Task, given: Array | None, repaired: Attempt | None, line: Array | None = None
