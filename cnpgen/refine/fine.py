@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.solver.bounds import BoundsTemplate, Tightening
+from cnpgen.refine.solver.bounds import NONE, BoundsTemplate
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, of_last
 from cnpgen.refine.task import Task
@@ -55,8 +55,7 @@ class FineCheck:
     def __init__(self, problem: Problem, world: "World", stage: ResidualKernels) -> None:
         self._grid = make_grid(stage.spec, POINTS, problem.path_orders)
         self._last = of_last(lambda task: Transcription(stage, self._grid, boundary=task.boundary, tops=task.tops))
-        none = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
-        self._bounds = BoundsTemplate(problem, world, self._grid.s, none)
+        self._bounds = BoundsTemplate(problem, world, self._grid.s, NONE)
         conditions = self._bounds.conditions
         self.equalities = {each.name for each in conditions if each.is_equality}
         self._equal = np.repeat([each.is_equality for each in conditions], [len(each.g) for each in conditions])

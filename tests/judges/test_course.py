@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from cnpgen.judges.plans.course import course, jerks
+from cnpgen.judges.plans.course import course, course_at, jerks
 from cnpgen.trajectory.motion import Motion
 from tests.examples.plans import KNOTS, load
 from tests.examples.plans import course as reference
@@ -35,6 +35,19 @@ def test_any_degree_and_number_of_control_points_will_do(degree: int) -> None:
     for lower, higher in (("q", "dq"), ("dq", "ddq"), ("ddq", "jerk")):
         slope = (getattr(after, lower) - getattr(before, lower)) / (2 * h) * rate
         np.testing.assert_allclose(slope, found[higher], rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("jerk", [False, True])
+def test_bases_that_are_kept_give_the_same_states(jerk: bool) -> None:
+    random = np.random.default_rng(5)
+    for points in (12, 17):  # of another number of control points, too
+        motion = Motion(random.normal(size=(1, points, 3)), random.uniform(0.5, 1, (1, points + 2)))
+        s = np.sort(random.uniform(size=31))
+        expected, found = course(motion, s, jerk=jerk), course_at(motion, tuple(s.tolist()), jerk=jerk)
+        for name, values in vars(expected).items():
+            assert (getattr(found, name) is None) == (values is None)
+            if values is not None:
+                np.testing.assert_allclose(getattr(found, name), values, rtol=1e-10, atol=1e-8)
 
 
 def test_both_ends_and_every_knot_are_met() -> None:

@@ -3,7 +3,19 @@
 import numpy as np
 import pytest
 
-from cnpgen.judges.plans.sampling import AT_ENDS, CELLS, FEW_CELLS, FEWEST, LONGEST, MOST, sample, time_table
+from cnpgen.judges.plans.sampling import (
+    AT_ENDS,
+    FEW_AT_ENDS,
+    FEW_CELLS,
+    FEW_PER_SPAN,
+    FEWEST,
+    LONGEST,
+    MOST,
+    few_phases,
+    sample,
+    time_table,
+    times,
+)
 from cnpgen.trajectory.motion import Motion
 from tests.examples.plans import load
 
@@ -52,18 +64,20 @@ def test_a_coarser_step_takes_fewer_samples():
     assert plan.judged(step=4e-3).samples < plan.judged().samples < plan.judged(step=5e-4).samples
 
 
+def test_a_first_look_is_at_phases_in_every_span_near_both_ends_and_where_it_is_told() -> None:
+    phases = np.array(few_phases(13, frozenset([0.1234])))
+    assert (phases[0], phases[-1]) == (0, 1)
+    assert np.all(np.diff(phases) > 0)
+    assert 0.1234 in phases
+    inside = np.histogram(phases, np.arange(14) / 13)[0]
+    assert inside.min() >= FEW_PER_SPAN
+    for near in (phases, 1 - phases):
+        assert np.sum((near > 0) & (near < 0.0501)) >= FEW_AT_ENDS
+        assert np.sum((near > 0) & (near < 1e-3)) >= 2
+
+
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
-def test_a_first_look_takes_fewer_samples_but_not_near_the_ends(label: str) -> None:
-    motion = load(label).motion
-    few, all_of_them = (
-        sample(time_table(motion.rate[0], 7, cells=cells), 1e-3, 13, sparse=sparse)
-        for cells, sparse in ((FEW_CELLS, True), (CELLS, False))
-    )
-    assert few is not None
-    assert all_of_them is not None
-    assert 0.2 < len(few.s) / len(all_of_them.s) < 0.5
-    exact = motion.time_at(few.s)[0]
-    np.testing.assert_allclose(few.t, exact, atol=2e-5)
-    assert np.diff(exact).max() <= 4e-3
-    for near in (few.s, 1 - few.s):
-        assert np.sum((near > 0) & (near < 0.0501)) >= AT_ENDS  # torques have peaks there that fewer do not show
+def test_a_table_of_few_cells_gives_the_times_as_well(label: str) -> None:
+    motion, phases = load(label).motion, np.array(few_phases(13))
+    exact = motion.time_at(phases)[0]
+    np.testing.assert_allclose(times(phases, time_table(motion.rate[0], 7, cells=FEW_CELLS)), exact, atol=2e-5)

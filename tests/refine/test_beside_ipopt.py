@@ -76,7 +76,7 @@ def test_a_programme_holds_what_it_is_told_and_its_sparse_jacobian_is_the_dense_
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0])
     shape = motion.evaluate(x).g.shape
     held = np.random.default_rng(0).random(shape) < 0.2
-    bounds = Bounds(np.full(shape, -1.0), np.full(shape, 1.0), np.zeros(shape, bool))
+    bounds = Bounds(np.full(shape, -1.0), np.full(shape, 1.0), np.zeros(shape, bool), np.full(shape, np.inf))
     nlp = Programme(motion, bounds, held, x).problem()
     derivative = ca.Function("derivative", [nlp["x"]], [ca.jacobian(nlp["g"], nlp["x"])])
     elsewhere = x + 0.05 * np.random.default_rng(1).normal(size=len(x))

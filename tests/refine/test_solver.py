@@ -9,13 +9,16 @@ import pytest
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans import Verdict
 from cnpgen.kernels.library import problem_kernels
+from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.planner.planner import Planner
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.passes import Pass
+from cnpgen.refine.plans import refine_plans
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled, quadratic, sqp, starts
-from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.bounds import USED, Bounds
 from cnpgen.refine.solver.compiled import CompiledSteps
 from cnpgen.refine.solver.criterion import Criterion, choose_criterion, criterion_residuals
 from cnpgen.refine.solver.grid import make_grid
@@ -327,7 +330,7 @@ def test_the_iteration_never_ends_worse_than_it_began() -> None:
     motion = transcription(plan, 48)
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0])
     cost, g = motion.value(x)
-    bounds = Bounds(np.full(g.shape, -1.0), np.full(g.shape, 1.0), np.zeros(g.shape, bool))
+    bounds = Bounds(np.full(g.shape, -1.0), np.full(g.shape, 1.0), np.zeros(g.shape, bool), np.full(g.shape, np.inf))
     result = minimise(motion, bounds, x, Settings(max_iterations=5))
     merit = Settings().penalty
     assert result.cost + merit * result.violation <= cost + merit * bounds.violation(g) + 1e-12
@@ -487,3 +490,44 @@ def test_a_slow_down_is_as_large_as_the_bound_asks_for_whatever_its_size(tmp_pat
     asked, line = task(plan), starts.straight(plan.boundary, plan.robot.velocity_limit, tool.spec)
     assert tool.check.too_fast(asked, np.concatenate([line[0].ravel(), np.log(line[1])])) > 1.2
     assert tool.check.too_fast(asked, tool.straight(asked)) == 1
+
+
+def test_four_points_tell_of_cubics_what_lies_in_the_middle_of_the_inner_two() -> None:
+    grid = make_grid(PROBLEMS["airhockey"].trajectory, 24)
+    cubic = np.polynomial.Polynomial([0.3, -2.0, 5.0, 7.0])
+    middle = (grid.s[1:-2] + grid.s[2:-1]) / 2
+    around = np.lib.stride_tricks.sliding_window_view(cubic(grid.s), 4)
+    np.testing.assert_allclose((grid.midway * around).sum(axis=1), cubic(middle), atol=1e-12)
+
+
+def test_bounds_are_tightened_beside_what_lies_too_far_outside_between_points() -> None:
+    grid, spare, left = make_grid(PROBLEMS["airhockey"].trajectory, 128), 0.01, 50
+    apex = (grid.s[left] + grid.s[left + 1]) / 2
+    g = np.exp(-1000 * (grid.s - apex) ** 2)[:, None] * [1.0, 0.0]
+    most = g.max()  # at both points beside the apex, which is further outside
+    bounds = Bounds(np.full(g.shape, -most), np.full(g.shape, most), np.zeros(g.shape, bool), np.full(g.shape, spare))
+    apart = float(grid.midway[left - 1] @ g[left - 1 : left + 3, 0]) - most
+    assert apart > spare
+    for sign in (1, -1):  # above and below
+        tighter = bounds.tightened(sign * g, grid.midway)
+        assert tighter is not None
+        moved = np.nonzero((tighter.upper < bounds.upper) | (tighter.lower > bounds.lower))
+        assert sorted(zip(*moved, strict=True)) == [(left, 0), (left + 1, 0)]
+        assert tighter.excess(sign * g).max() == pytest.approx(apart - USED * spare, rel=1e-6)
+    assert replace(bounds, spare=np.full(g.shape, 1.2 * apart)).tightened(g, grid.midway) is None
+
+
+@needs_compiler
+def test_what_lies_between_points_is_mended_in_the_same_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = draw_boundary_problems("airhockey-replan", 69, seed=555_001).boundary
+    plans = Planner("airhockey-replan").plan_batch(drawn[[9, 15, 22, 32, 40, 46, 50, 68]])  # too much there at first
+    found = {}
+    for looks in (0, sqp.LOOKS):
+        monkeypatch.setattr(sqp, "LOOKS", looks)
+        found[looks] = refine_plans(plans, workers=1)
+        assert found[looks].valid.all()
+    polished = {looks: sum(each.outcome is Outcome.POLISHED for each in made.refined) for looks, made in found.items()}
+    assert polished[0] >= 6
+    assert polished[sqp.LOOKS] <= 1
+    slower = found[sqp.LOOKS].plans.duration / found[0].plans.duration
+    assert slower.mean() < 1.001

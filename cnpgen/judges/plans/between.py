@@ -77,8 +77,9 @@ def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least
     for _ in range(HALVINGS):
         if not len(pieces):
             break
-        width = np.tile(width / 2, 2)
-        of_row, left = np.tile(of_row, 2), np.concatenate([left, left + width[: len(left)]])
+        width = width / 2
+        left = np.concatenate([left, left + width])
+        width, of_row = np.concatenate([width, width]), np.concatenate([of_row, of_row])
         pieces = np.concatenate([pieces @ half for half in _halving(rows.shape[2])])
         for k, s in ((0, left), (-1, left + width)):
             top = int(np.argmax(pieces[:, k]))

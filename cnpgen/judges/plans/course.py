@@ -1,15 +1,18 @@
 """One motion at many phases: joint positions and their derivatives in time, joint by joint."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spline import taylor
+from cnpgen.trajectory.spline import basis, taylor
 
 Array = NDArray[np.float64]
+ORDERS = 3  # of the path, positions among them, that accelerations are made of; jerks take one more
 
 
 @dataclass(frozen=True)
@@ -43,16 +46,45 @@ def course(motion: Motion, s: Array, *, jerk: bool = False) -> Course:
         s: Phases in [0, 1], shape (K,).
         jerk: Whether jerks are wanted.
     """
-    p, p1, p2 = _derivatives(motion.path[0], motion.degree, s, orders=3)
-    r, r1 = _derivatives(motion.rate[0, :, None], motion.degree, s, orders=2)
-    return Course(q=p, dq=p1 * r, ddq=(p2 * r + p1 * r1) * r, jerk=jerks(motion, s) if jerk else None)
+    orders = ORDERS + jerk
+    p = _derivatives(motion.path[0], motion.degree, s, orders=orders)
+    return _in_time(p, _derivatives(motion.rate[0, :, None], motion.degree, s, orders=orders - 1))
+
+
+def course_at(motion: Motion, phases: tuple[float, ...], *, jerk: bool = False) -> Course:
+    """Evaluate one motion like ``course``, at phases at which many are: the bases of splines there are kept."""
+    orders = ORDERS + jerk
+    points, rates = motion.path.shape[1], motion.rate.shape[1]
+    p = motion.path[0].T @ _bases(points, motion.degree, orders, phases)
+    r = motion.rate[0] @ _bases(rates, motion.degree, orders - 1, phases)
+    count = len(phases)
+    return _in_time(
+        [p[:, k * count : (k + 1) * count] for k in range(orders)],
+        [r[k * count : (k + 1) * count] for k in range(orders - 1)],
+    )
+
+
+@cache
+def _bases(points: int, degree: int, orders: int, phases: tuple[float, ...]) -> Array:
+    """Bases of a spline and of its derivatives, one after the other, shape (C, orders K)."""
+    s = np.array(phases)
+    return np.ascontiguousarray(np.concatenate([basis(s, points, degree, order) for order in range(orders)]).T)
 
 
 def jerks(motion: Motion, s: Array) -> Array:
     """Evaluate the joint jerks of one motion at phases s [rad/s^3], shape (n, K)."""
-    _, p1, p2, p3 = _derivatives(motion.path[0], motion.degree, s, orders=4)
-    r, r1, r2 = _derivatives(motion.rate[0, :, None], motion.degree, s, orders=3)
-    return np.asarray(((p3 * r + 3 * p2 * r1) * r + p1 * (r2 * r + r1**2)) * r)
+    p = _derivatives(motion.path[0], motion.degree, s, orders=4)
+    return _jerks(p, _derivatives(motion.rate[0, :, None], motion.degree, s, orders=3))
+
+
+def _in_time(p: Sequence[Array], r: Sequence[Array]) -> Course:
+    """Turn derivatives of path and rate by phase into those of positions by time."""
+    ddq = (p[2] * r[0] + p[1] * r[1]) * r[0]
+    return Course(q=p[0], dq=p[1] * r[0], ddq=ddq, jerk=_jerks(p, r) if len(p) > ORDERS else None)
+
+
+def _jerks(p: Sequence[Array], r: Sequence[Array]) -> Array:
+    return np.asarray(((p[3] * r[0] + 3 * p[2] * r[1]) * r[0] + p[1] * (r[2] * r[0] + r[1] ** 2)) * r[0])
 
 
 def _derivatives(control: Array, degree: int, s: Array, *, orders: int) -> list[Array]:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.between import polynomials
 from cnpgen.judges.plans.closer import look_closer
-from cnpgen.judges.plans.course import course, jerks
+from cnpgen.judges.plans.course import Course, course, course_at, jerks
 from cnpgen.judges.plans.limits import is_proven, limit_margin
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
 from cnpgen.judges.plans.peaks import look_at_peaks
-from cnpgen.judges.plans.sampling import CELLS, FEW_CELLS, Samples, sample, time_table
+from cnpgen.judges.plans.sampling import FEW_CELLS, LONGEST, Samples, few_phases, sample, time_table, times
 from cnpgen.judges.plans.survey import Survey, survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.obstacles import obstacle_tops
@@ -32,7 +32,7 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 LONGEST_STEP = 0.01  # s: looks further apart miss most of what a robot does in between
-_GLANCE = np.linspace(0, 1, 33)  # phases at which most plans that are not valid show it
+_GLANCE = tuple(np.linspace(0, 1, 33).tolist())  # phases at which most plans that are not valid show it
 
 
 def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
@@ -147,9 +147,19 @@ class _Plan:
     tops: Array
     goal_xyz: Array
 
+    @property
+    def spans(self) -> int:
+        """Number of intervals between the knots of the finer spline."""
+        return max(self.motion.path.shape[1], self.motion.rate.shape[1]) - self.motion.degree
+
+    @property
+    def kinks(self) -> frozenset[float]:
+        """Phases at which constraints change abruptly."""
+        return frozenset(s for constraint in self.problem.constraint for s in constraint.kinks)
+
     def is_finite(self) -> bool:
         numbers = (self.motion.path, self.motion.rate, self.tops, self.goal_xyz, *vars(self.boundary).values())
-        return all(values is None or bool(np.all(np.isfinite(values))) for values in numbers)
+        return all(values is None or bool(np.isfinite(values).all()) for values in numbers)
 
 
 def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> None:
@@ -169,11 +179,10 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
 
 def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
-    found = _samples(plan, step, sparse=brief)
+    found = _first_look(plan) if brief else _look(plan, step)
     if isinstance(found, Verdict):
         return found
-    samples, table = found
-    states = course(plan.motion, samples.s, jerk=plan.problem.uses_jerk)
+    states, samples, table = found
     if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
     world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
@@ -207,8 +216,8 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     """Whether the ends, or a constraint at one of a few phases, are wrong."""
     if not plan.is_finite() or not plan.motion.runs_forward()[0]:
         return True
-    samples = Samples(_GLANCE, _GLANCE)
-    states = course(plan.motion, samples.s, jerk=plan.problem.uses_jerk)
+    samples = Samples(np.array(_GLANCE), np.array(_GLANCE))
+    states = course_at(plan.motion, _GLANCE, jerk=plan.problem.uses_jerk)
     if not states.is_finite():
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
@@ -219,18 +228,39 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
 
 
-def _samples(plan: _Plan, step: float, *, sparse: bool) -> tuple[Samples, Array] | Verdict:
-    """Choose where to look, and tabulate the times, or say why there is nothing to look at."""
-    if not plan.is_finite():
-        return Verdict(Reason.NOT_FINITE)
-    if not plan.motion.runs_forward()[0]:
-        return Verdict(Reason.RATE)
+def _look(plan: _Plan, step: float) -> tuple[Course, Samples, Array] | Verdict:
+    """Choose where to look, look there, and tabulate the times; or say why there is nothing to look at."""
+    if fault := _fault(plan):
+        return Verdict(fault)
     rate, degree = plan.motion.rate[0], plan.motion.degree
-    table = time_table(rate, degree, cells=FEW_CELLS if sparse else CELLS)
-    spans = max(plan.motion.path.shape[1], len(rate)) - degree
-    kinks = {s for constraint in plan.problem.constraint for s in constraint.kinks}
-    samples = sample(table, step, spans, kinks, sparse=sparse)
-    return (samples, table) if samples else Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
+    table = time_table(rate, degree)
+    samples = sample(table, step, plan.spans, plan.kinks)
+    if samples is None:
+        return _too_long(table)
+    return course(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples, table
+
+
+def _first_look(plan: _Plan) -> tuple[Course, Samples, Array] | Verdict:
+    """Look at few phases, the same ones for every plan of a problem; see ``_look``."""
+    if fault := _fault(plan):
+        return Verdict(fault)
+    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=FEW_CELLS)
+    if not table[1, -1] < LONGEST:
+        return _too_long(table)
+    phases = few_phases(plan.spans, plan.kinks)
+    s = np.array(phases)
+    return course_at(plan.motion, phases, jerk=plan.problem.uses_jerk), Samples(s, times(s, table)), table
+
+
+def _fault(plan: _Plan) -> Reason | None:
+    """Say why a plan cannot be evaluated, if it cannot."""
+    if not plan.is_finite():
+        return Reason.NOT_FINITE
+    return None if plan.motion.runs_forward()[0] else Reason.RATE
+
+
+def _too_long(table: Array) -> Verdict:
+    return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
 
 
 def reason_of(margins: list[Margin]) -> str:

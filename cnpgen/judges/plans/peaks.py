@@ -9,6 +9,7 @@ is divided, and its parts again, whose differences tell more.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,11 +108,17 @@ def _first(s: Array, measured: Sequence[Measured]) -> _Rows:
 
 def _tops(s: Array, values: Array) -> Array:
     """Estimate from above how large functions are between neighbouring samples, shape (rows, K - 1)."""
-    step, rise = np.diff(s, axis=1), np.diff(values, axis=1)
-    bend = 2 * np.diff(rise / step, axis=1) / (step[:, 1:] + step[:, :-1])
-    around = np.pad(bend, ((0, 0), (2, 2)), mode="edge")  # those at both ends of an interval, and their neighbours
-    pairs = np.minimum(around[:, 1:], around[:, :-1]), np.maximum(around[:, 1:], around[:, :-1])
-    low, high = np.minimum(pairs[0][:, 2:], pairs[0][:, :-2]), np.maximum(pairs[1][:, 2:], pairs[1][:, :-2])
+    step, rise = s[:, 1:] - s[:, :-1], values[:, 1:] - values[:, :-1]
+    slope = rise / step
+    bend = 2 * (slope[:, 1:] - slope[:, :-1]) / (step[:, 1:] + step[:, :-1])
+    around = bend[:, _neighbours(values.shape[1])]  # those at both ends of an interval, and beyond
+    low, high = around.min(axis=1), around.max(axis=1)
     sag = np.maximum((high - 2 * low) * step**2 / 2, TINY)
     over = np.maximum(sag - np.abs(rise), 0.0)
     return np.asarray(np.maximum(values[:, 1:], values[:, :-1]) + over**2 / (4 * sag))
+
+
+@cache
+def _neighbours(count: int) -> Indices:
+    """For each interval between so many samples, the samples at its ends and next to these that are no ends of all."""
+    return np.clip(np.arange(-2, 2)[:, None] + np.arange(count - 1), 0, count - 3)

@@ -19,7 +19,7 @@ CELLS, FEW_CELLS = 4096, 512  # of equal size in the table of times, and in that
 PER_SPAN = 8  # samples between two knots, evenly in phase
 AT_ENDS = 64  # additional samples at each end
 END = 0.05  # how far from each end they reach, in phase
-SPARSE = 4  # times fewer samples are enough for a first look
+FEW_PER_SPAN, FEW_AT_ENDS = 8, 16  # the same of a first look, which has no others
 
 
 @dataclass(frozen=True)
@@ -50,22 +50,27 @@ def time_table(rate: Array, degree: int, *, cells: int = CELLS) -> Array:
     Returns:
         Shape (2, C), both rows ascending: phases from 0 to 1, times from 0 to the duration.
     """
-    phases = _table_phases(cells)
+    phases, halves = _table_phases(cells)
     inverse = 1.0 / (_nodes(len(rate), degree, cells) @ rate)
-    times = np.cumsum((inverse[::2] + inverse[1::2]) * np.diff(phases) / 2)
-    return np.stack([phases, np.concatenate([[0.0], times])])
+    table = np.zeros((2, len(phases)))
+    table[0] = phases
+    np.cumsum((inverse[::2] + inverse[1::2]) * halves, out=table[1, 1:])
+    return table
 
 
 @cache
-def _table_phases(cells: int) -> Array:
-    """Phases between which 1 / r is smooth: even ones, and geometric ones near the ends, where r may be almost 0."""
+def _table_phases(cells: int) -> tuple[Array, Array]:
+    """Phases between which 1 / r is smooth: even ones, and geometric ones near the ends, where r may be almost 0.
+
+    Returns:
+        The phases, shape (C,), and half the distance of each two of them, shape (C - 1,).
+    """
     near = np.geomspace(1e-9, 12 / cells, 160)
-    return np.unique(np.concatenate([np.linspace(0, 1, cells + 1), near, 1 - near]))
+    phases = np.unique(np.concatenate([np.linspace(0, 1, cells + 1), near, 1 - near]))
+    return phases, np.diff(phases) / 2
 
 
-def sample(
-    table: Array, step: float, spans: int, also: Collection[float] = (), *, sparse: bool = False
-) -> Samples | None:
+def sample(table: Array, step: float, spans: int, also: Collection[float] = ()) -> Samples | None:
     """Choose samples that are at most ``step`` apart and see everything that a B-spline can do.
 
     * Times, at least ``FEWEST``, no more than ``step`` apart, but not above ``MOST``.
@@ -78,7 +83,6 @@ def sample(
         step: Time step [s].
         spans: Number of intervals between the knots of the finer spline.
         also: Further phases.
-        sparse: Whether ``SPARSE`` times fewer in time are enough, half of them in every span, and all near the ends.
 
     Returns:
         The samples, or None if the motion takes ``LONGEST`` or more.
@@ -86,13 +90,29 @@ def sample(
     duration = table[1, -1]
     if not duration < LONGEST:
         return None
-    fewer = SPARSE if sparse else 1
-    count = max(FEWEST // fewer, min(MOST, int(np.ceil(SPARE * duration / (fewer * step))) + 1))
+    count = max(FEWEST, min(MOST, int(np.ceil(SPARE * duration / step)) + 1))
     by_time = np.interp(np.linspace(0, duration, count), table[1], table[0])
-    near = END * np.linspace(0, 1, AT_ENDS + 1) ** 2
-    evenly = np.linspace(0, 1, (PER_SPAN // 2 if sparse else PER_SPAN) * spans + 1)
-    s = np.unique(np.concatenate([by_time, evenly, near, 1 - near, list(also)]))
+    s = np.unique(np.concatenate([by_time, _phases(PER_SPAN * spans, AT_ENDS, also)]))
     return Samples(s, times(s, table))
+
+
+@cache
+def few_phases(spans: int, also: frozenset[float] = frozenset()) -> tuple[float, ...]:
+    """Return the phases of a first look, ascending: ``FEW_PER_SPAN`` in every span and ``FEW_AT_ENDS`` near each end.
+
+    They are the same for all motions, however long these take.
+
+    Args:
+        spans: Number of intervals between the knots of the finer spline.
+        also: Further phases.
+    """
+    return tuple(np.unique(_phases(FEW_PER_SPAN * spans, FEW_AT_ENDS, also)).tolist())
+
+
+def _phases(evenly: int, at_ends: int, also: Collection[float]) -> Array:
+    """Return phases at even distances and, quadratically spaced, near both ends; in no order."""
+    near = END * np.linspace(0, 1, at_ends + 1) ** 2
+    return np.concatenate([np.linspace(0, 1, evenly + 1), near, 1 - near, list(also)])
 
 
 def times(s: Array, table: Array) -> Array:
@@ -103,7 +123,6 @@ def times(s: Array, table: Array) -> Array:
 @cache
 def _nodes(points: int, degree: int, cells: int) -> Array:
     """Basis of r at the Gauss nodes of the table's cells, shape (2 cells, R)."""
-    phases = _table_phases(cells)
-    middle, half = (phases[1:] + phases[:-1]) / 2, np.diff(phases) / 2
-    offset = half / np.sqrt(3)
+    phases, halves = _table_phases(cells)
+    middle, offset = (phases[1:] + phases[:-1]) / 2, halves / np.sqrt(3)
     return basis(np.stack([middle - offset, middle + offset], axis=1).ravel(), points, degree)

@@ -23,6 +23,7 @@ EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exce
 NEGLIGIBLE = 1e-5  # of scaled residuals: iterations end with larger violations than that
 UNTOLD = 1e9  # so many scaled units are allowed where only the verdict can tell
 SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
+USED = 0.9  # of what residuals may be further outside between grid points, by what four of these say
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class Tightening:
     edge: float
 
 
+NONE = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
+
+
 @dataclass(frozen=True)
 class Bounds:
     """Bounds of the residuals on the grid, in scaled units.
@@ -53,11 +57,13 @@ class Bounds:
         upper: Shape (K, m).
         sharp: Which residuals leap with the last rate control points, shape (K, m): those of accelerations and jerks at
             the ends.
+        spare: How far beyond them the verdict lets residuals be, shape (K, m), inf where nothing is known.
     """
 
     lower: Array
     upper: Array
     sharp: NDArray[np.bool_]
+    spare: Array
 
     def excess(self, g: Array) -> Array:
         """How far residuals g are outside, shape (K, m); negative inside."""
@@ -71,6 +77,26 @@ class Bounds:
         """Worst violation of residuals g, shape (K, m); inf where g is not finite."""
         worst = float(self.excess(g).max())
         return max(worst, 0.0) if np.isfinite(worst) else np.inf
+
+    def tightened(self, g: Array, midway: Array) -> "Bounds | None":
+        """Return bounds that are tighter where residuals g, shape (K, m), hide too much between grid points, or None.
+
+        Args:
+            g: Residuals.
+            midway: As ``Grid.midway``.
+        """
+        middle = sum(weights[:, None] * g[k : k + len(midway)] for k, weights in enumerate(midway.T))
+        left, right = slice(1, -2), slice(2, -1)  # of the intervals between the second and the last but one
+        spare = USED * np.minimum(self.spare[left], self.spare[right])
+        above = middle - np.maximum(self.upper[left], self.upper[right]) - spare
+        below = np.minimum(self.lower[left], self.lower[right]) - middle - spare
+        if not (above.max() > 0 or below.max() > 0):
+            return None
+        lower, upper = self.lower.copy("F"), self.upper.copy("F")
+        for side in (left, right):
+            upper[side] -= np.maximum(above, 0.0)
+            lower[side] += np.maximum(below, 0.0)
+        return Bounds(lower, upper, self.sharp, self.spare)
 
 
 class BoundsTemplate:
@@ -94,7 +120,10 @@ class BoundsTemplate:
         forms = [constraint.solved for constraint in problem.constraint]
         needs = measured_needs(forms, world, jerk=problem.uses_jerk)  # the world is left as the bounds are read off
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
-        tables = [_bounds(*pair, s, tightening, need) for pair, need in zip(pairs, needs, strict=True)]
+        tables, loose = (
+            [_bounds(*pair, s, tight, need) for pair, need in zip(pairs, needs, strict=True)]
+            for tight in (tightening, NONE)
+        )
         self._tightening = tightening
         self._s, self._funnelled = s, s * (SOONER if tightening.band else 1.0)
         self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # as residuals lie
@@ -105,6 +134,12 @@ class BoundsTemplate:
         widths = [len(each.g) for each in self.conditions]
         self.needs = np.repeat(needs, widths)
         self.capsules = np.repeat([isinstance(each, RobotClearance | SelfClearance) for each, _ in pairs], widths)
+        with np.errstate(invalid="ignore"):
+            spare = self.allowed + np.fmax(
+                np.concatenate([high for _, high in loose], axis=1) - self._upper,
+                self._lower - np.concatenate([low for low, _ in loose], axis=1),
+            )
+        self._spare = np.asfortranarray(np.where(np.isnan(spare), np.inf, spare))
         self._sharp = np.zeros(self._lower.shape, bool, order="F")
         self._sharp[[*ENDS, *(-1 - each for each in ENDS)]] = self.needs >= 2
 
@@ -134,6 +169,7 @@ class BoundsTemplate:
             np.asfortranarray(np.hstack([bounds.lower - free, lower])),
             np.asfortranarray(np.hstack([bounds.upper + free, np.full_like(lower, np.inf)])),
             np.asfortranarray(np.hstack([bounds.sharp, np.zeros(lower.shape, bool)])),
+            np.asfortranarray(np.hstack([bounds.spare, np.full_like(lower, np.inf)])),
         )
 
     def _eased(self, bounds: Bounds, ends: Array) -> Bounds:
@@ -147,7 +183,7 @@ class BoundsTemplate:
                 upper = np.asfortranarray(upper + np.minimum(above, self.allowed) * open_)
             if np.any(below > 0):
                 lower = np.asfortranarray(lower - np.minimum(below, self.allowed) * open_)
-        return Bounds(lower, upper, bounds.sharp)
+        return Bounds(lower, upper, bounds.sharp, bounds.spare)
 
     def _of(self, start_tip: Array) -> Bounds:
         lower, upper = self._lower, self._upper
@@ -158,7 +194,7 @@ class BoundsTemplate:
                 lower, upper = lower.copy("F"), upper.copy("F")
                 lower[:, columns] -= wider[:, None] / scale
                 upper[:, columns] += wider[:, None] / scale
-        return Bounds(lower, upper, self._sharp)
+        return Bounds(lower, upper, self._sharp, self._spare)
 
 
 def _funnels(pairs: list[tuple[Constraint, Condition]]) -> Iterator[tuple[Constraint, Condition, slice]]:

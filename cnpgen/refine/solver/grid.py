@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,16 @@ class Grid:
     weights: Array
     criterion: Bases
     criterion_weights: Array
+
+    @cached_property
+    def midway(self) -> Array:
+        """What four points in a row say of the middle of the inner two, shape (K - 3, 4): Lagrange's weights."""
+        near = np.stack([self.s[k : len(self.s) - 3 + k] for k in range(4)], axis=1)
+        middle = (near[:, 1] + near[:, 2]) / 2
+        weights = np.ones_like(near)
+        for k, other in permutations(range(4), 2):
+            weights[:, k] *= (middle - near[:, other]) / (near[:, k] - near[:, other])
+        return weights
 
 
 def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:

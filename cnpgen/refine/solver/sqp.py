@@ -38,6 +38,7 @@ NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; shar
 LAST_STEPS = 3  # before a deadline land
 SHORTEST = 30.0  # weight of the proximal term in these: nothing but the shortest way to what is feasible counts
 UNEVEN = 1.3  # times the longest step that there was is left for the next
+LOOKS = 2  # between the points of the grid that may call for tighter bounds
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
 
@@ -138,7 +139,7 @@ class _Descent:
     landing = False
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
-        self._steps = steps_of(motion, bounds, settings.thin)
+        self._steps, self._motion, self._looks = steps_of(motion, bounds, settings.thin), motion, LOOKS
         self.x = self._start = x
         self.cost, self._g, self.violation = self._steps.value(x)
         self.ended = not self.violation < settings.far
@@ -216,8 +217,19 @@ class _Descent:
             self.ended = (self._settled or self.landing) and violation < settings.violation_tolerance
             self.x, self.cost, self._g, self.violation, self._length = x, cost, g, violation, size
             self._missed[:] = False
+            if self.ended and not self.landing and self._looks:
+                self._look_between()
         else:
             self._learn(self._bounds.excess(g), held, size)
+
+    def _look_between(self) -> None:
+        """Go on within tighter bounds where residuals are too far outside between the points of the grid."""
+        tighter = self._bounds.tightened(self._g, self._motion.grid.midway)
+        if tighter is None:
+            return
+        self.ended, self._looks, self._bounds = False, self._looks - 1, tighter
+        self._steps = steps_of(self._motion, tighter, self._settings.thin)
+        self.violation = tighter.violation(self._g)
 
     def _learn(self, excess: Array, held: Mask, size: float) -> None:
         """Hold what a refused step broke unseen; make the next one shorter unless that was the worst of it."""
