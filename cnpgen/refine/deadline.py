@@ -8,6 +8,7 @@ import numpy as np
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import Candidate, Search, as_given, unusable
 from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.task import Outcome, Refined, Task
 
 VERDICT = 5e-3  # s: what a verdict takes, until one was timed
@@ -39,7 +40,7 @@ def refine_until(refiner: Refiner, jury: Jury, task: Task, seconds: float) -> Re
         reserve = MARGIN * (time.perf_counter() - begun)
         if best.refined.valid:
             break
-    attempts = refiner.attempts(replace(task, until=until - reserve), given)
+    attempts = refiner.attempts(replace(task, deadline=Deadline(until - reserve)), given)
     cut = late = best is not None and time.perf_counter() + reserve > until
     while not late and (attempt := next(attempts, None)) is not None:
         cut |= attempt.outcome is Outcome.UNSETTLED

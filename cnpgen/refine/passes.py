@@ -9,6 +9,7 @@ from cnpgen.refine.solver.sqp import Settings
 EARLY, LATE = 0.012, 0.05  # phases where tightening is whole; contacts at the ends need the later one
 WARM_RADIUS = 0.1  # first trust radius from a plan that is nearly right
 WIDE_FUNNEL = 1.0  # from a plan that is nearly right; it saves steps, and loses some motions from nothing
+WARM_NEAR = ((0.09, 1.0), (0.04, 0.3), (-1.0, 0.1))  # first steps from such a plan speed it up as a whole
 FAR = 100.0  # a plan that violates more, in scaled units, is a worse start than a straight line
 FROM_NOTHING, CROWDED = 0.1, 0.05  # shares of the tolerance from nothing, where small steps still lead far
 
@@ -52,7 +53,7 @@ def default_passes(problem: Problem, settings: Settings) -> Passes:
     cold = replace(settings, cost_tolerance=(CROWDED if crowded else FROM_NOTHING) * settings.cost_tolerance)
     longer = replace(cold, max_iterations=settings.max_iterations * 3 // 2)
     return Passes(
-        Pass(128, room, replace(near, funnel=WIDE_FUNNEL, far=FAR)),
+        Pass(128, room, replace(near, near=WARM_NEAR, funnel=WIDE_FUNNEL, far=FAR)),
         Pass(128, room, cold),
         Pass(256, room, short),
         Pass(256, strict, short),

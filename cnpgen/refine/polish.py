@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.bounds import PRECISE
 from cnpgen.refine.task import Attempt, Outcome, Refined, Task
 from cnpgen.trajectory.motion import Motion
 
 Array = NDArray[np.float64]
 
-PRECISE = 0.1  # of an equality's tolerance, beyond what the ends need: the optimiser's band is narrower
 SAME = 1e-12  # rad and 1/s: control points that differ by less are the same but for rounding
 GIVEN = {Outcome.KEPT, Outcome.ADJUSTED}
 HOPELESS = 3.0  # excess above which an attempt is not worth a verdict, unless there is no better one
@@ -76,6 +76,11 @@ class Search:
             self.judged.append(self._candidate(min(self.hopeless, key=lambda each: (each.excess, each.cost))))
         return min(self.judged, key=lambda each: (each.severity, not each.precise, each.refined.cost))
 
+    def is_shorter(self, best: Refined, given: Array | None) -> bool:
+        """Whether a valid plan costs less than the time that the given one takes, of variables ``given``, or None."""
+        motion = self.refiner.check.transcription(self.task)
+        return best.valid and given is not None and best.cost < motion.duration(np.exp(given[motion.split :]))
+
     def may_be_better(self, path: Array, rate: Array, cost: float, best: Refined) -> bool:
         """Whether a plan is worth a verdict: beside a valid one it is if it costs no more and is not refuted."""
         return not best.valid or (cost <= best.cost and not self.jury.refutes(self.task, path, rate))
@@ -114,9 +119,9 @@ def refine_task(refiner: Refiner, jury: Jury, task: Task) -> Refined:
     for attempt in refiner.attempts(task, given):
         if search.offer(attempt):
             break
-    best = search.best()
-    for path, rate, outcome in as_given(refiner, task, given):
-        cost = refiner.check.transcription(task).objective(path, rate)
+    best, motion = search.best(), refiner.check.transcription(task)
+    for path, rate, outcome in () if search.is_shorter(best.refined, given) else as_given(refiner, task, given):
+        cost = motion.objective(path, rate)
         if search.may_be_better(path, rate, cost, best.refined):
             kept = search.weigh(path, rate, cost, outcome)
             best = min(best, kept, key=lambda each: each.rank)

@@ -129,7 +129,7 @@ class Refiner:
         if given is not None or not np.array_equal(even, self.straight(task)):
             best = yield from self._restarted(task, None, even, best)
         best = yield from self._restarted(task, best.x, even, best)
-        if task.until == np.inf and keeps_clear(self.problem, self.robot):
+        if task.deadline is None and keeps_clear(self.problem, self.robot):
             yield from self._around(task, best)
 
     def _restarted(
@@ -255,7 +255,7 @@ class Refiner:
         if hulls is not None:
             motion = HullTranscription(self.stage, motion.grid, hulls, boundary=task.boundary, tops=task.tops)
             bounds = self._bounds[which].on_hulls(bounds, hulls.least)
-        return minimise(motion, bounds, x, settings, until=task.until)
+        return minimise(motion, bounds, x, settings, deadline=task.deadline)
 
     def transcription(self, task: Task, which: Pass) -> Transcription:
         """Return the motion on the grid of a pass."""

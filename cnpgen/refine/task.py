@@ -1,6 +1,5 @@
 """One boundary problem for the refiner, and what comes of it."""
 
-import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Reason
+from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Task:
         goal_xyz: Position of the tip at the goal [m], shape (3,).
         path: Path control points of the given plan [rad], shape (C, n), or None.
         rate: Its rate control points [1/s], shape (R,), or None.
-        until: When steps should be over, as ``time.perf_counter`` counts [s].
+        deadline: When steps should be over, if that matters.
     """
 
     boundary: Boundary
@@ -64,7 +64,7 @@ class Task:
     goal_xyz: Array
     path: Array | None = None
     rate: Array | None = None
-    until: float = math.inf
+    deadline: Deadline | None = None
 
     @property
     def at_rest(self) -> bool:

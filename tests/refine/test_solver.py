@@ -390,7 +390,10 @@ def test_a_first_pass_that_ends_within_its_bounds_is_offered_at_once_and_measure
     assert excess.worst < 3
 
 
-def test_a_valid_plan_that_is_off_the_table_by_more_than_a_tenth_of_the_tolerance_is_polished_once() -> None:
+def test_a_valid_plan_that_is_off_the_table_by_more_than_a_tenth_of_the_tolerance_is_polished_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sqp, "LOOKS", 0)  # which would mend it at once
     plan = load("hit")
     usual = refiner("airhockey").passes
     wide = replace(usual.first, tightening=replace(usual.first.tightening, band=0.4))
@@ -519,8 +522,7 @@ def test_bounds_are_tightened_beside_what_lies_too_far_outside_between_points() 
 
 @needs_compiler
 def test_what_lies_between_points_is_mended_in_the_same_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = draw_boundary_problems("airhockey-replan", 69, seed=555_001).boundary
-    plans = Planner("airhockey-replan").plan_batch(drawn[[9, 15, 22, 32, 40, 46, 50, 68]])  # too much there at first
+    plans = Planner("airhockey-replan").plan_batch(draw_boundary_problems("airhockey-replan", 120, seed=7).boundary)
     found = {}
     for looks in (0, sqp.LOOKS):
         monkeypatch.setattr(sqp, "LOOKS", looks)
@@ -528,6 +530,6 @@ def test_what_lies_between_points_is_mended_in_the_same_pass(monkeypatch: pytest
         assert found[looks].valid.all()
     polished = {looks: sum(each.outcome is Outcome.POLISHED for each in made.refined) for looks, made in found.items()}
     assert polished[0] >= 6
-    assert polished[sqp.LOOKS] <= 1
+    assert polished[sqp.LOOKS] <= 2
     slower = found[sqp.LOOKS].plans.duration / found[0].plans.duration
     assert slower.mean() < 1.001

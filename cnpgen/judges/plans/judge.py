@@ -150,7 +150,7 @@ class _Plan:
     @property
     def spans(self) -> int:
         """Number of intervals between the knots of the finer spline."""
-        return max(self.motion.path.shape[1], self.motion.rate.shape[1]) - self.motion.degree
+        return int(max(self.motion.path.shape[1], self.motion.rate.shape[1])) - self.motion.degree
 
     @property
     def kinks(self) -> frozenset[float]:

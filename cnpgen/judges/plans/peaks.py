@@ -121,4 +121,4 @@ def _tops(s: Array, values: Array) -> Array:
 @cache
 def _neighbours(count: int) -> Indices:
     """For each interval between so many samples, the samples at its ends and next to these that are no ends of all."""
-    return np.clip(np.arange(-2, 2)[:, None] + np.arange(count - 1), 0, count - 3)
+    return np.asarray(np.clip(np.arange(-2, 2)[:, None] + np.arange(count - 1), 0, count - 3))

@@ -23,7 +23,8 @@ EASE = (0.1, 0.3)  # phases between which a motion must leave what its ends exce
 NEGLIGIBLE = 1e-5  # of scaled residuals: iterations end with larger violations than that
 UNTOLD = 1e9  # so many scaled units are allowed where only the verdict can tell
 SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
-USED = 0.9  # of what residuals may be further outside between grid points, by what four of these say
+PRECISE = 0.1  # of an equality's tolerance is what plans should miss it by at most
+USED = 0.95  # of what residuals may be further outside between grid points, by what four of these say
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Bounds:
         upper: Shape (K, m).
         sharp: Which residuals leap with the last rate control points, shape (K, m): those of accelerations and jerks at
             the ends.
-        spare: How far beyond them the verdict lets residuals be, shape (K, m), inf where nothing is known.
+        spare: How far beyond them residuals may be between grid points, shape (K, m): as far as the verdict allows, or
+            is precise where they are equalities; inf where nothing is known.
     """
 
     lower: Array
@@ -134,8 +136,9 @@ class BoundsTemplate:
         widths = [len(each.g) for each in self.conditions]
         self.needs = np.repeat(needs, widths)
         self.capsules = np.repeat([isinstance(each, RobotClearance | SelfClearance) for each, _ in pairs], widths)
+        equal = np.repeat([each.is_equality for each in self.conditions], widths)
         with np.errstate(invalid="ignore"):
-            spare = self.allowed + np.fmax(
+            spare = np.where(equal, PRECISE, 1.0) * self.allowed + np.fmax(
                 np.concatenate([high for _, high in loose], axis=1) - self._upper,
                 self._lower - np.concatenate([low for low, _ in loose], axis=1),
             )

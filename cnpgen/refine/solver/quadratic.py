@@ -24,6 +24,7 @@ USED = 1e-3  # its slope where nothing is violated
 MULTIPLIER = 1e-9  # smaller ones belong to residuals that are not active
 FEASIBLE = 1e-6  # of DAQP
 CHANGES = 3000  # largest number of working-set changes
+NEAR_OTHERS = 0.4  # accelerations grow with the square of the rate; what they are not in is held within this at most
 LOWER, UPPER = 3, 1  # how DAQP is told what is active
 
 
@@ -213,11 +214,12 @@ def choose(g: Array, bounds: Bounds, *, thin: int, near: float, leaps: Array) ->
         g: Residuals, shape (K, m).
         bounds: Their bounds.
         thin: Every how many grid points the thinned grid has one.
-        near: What is close.
+        near: What is close; at most ``NEAR_OTHERS`` for residuals that no acceleration is in.
         leaps: How far sharp residuals may leap, shape (K, m).
     """
     excess = bounds.excess(g)
-    picked: Mask = (crests(excess, thin=thin) & (excess > -near)) | (bounds.sharp & (excess > -leaps))
+    within = np.where(bounds.sharp[0], near, min(near, NEAR_OTHERS))
+    picked: Mask = (crests(excess, thin=thin) & (excess > -within)) | (bounds.sharp & (excess > -leaps))
     return picked
 
 

@@ -13,7 +13,6 @@ Once a step has changed the objective by less than the tolerance, and promised n
 next ones to what makes the iterate feasible: it lands.
 """
 
-import math
 import time
 from dataclasses import dataclass, replace
 
@@ -29,11 +28,12 @@ Array = NDArray[np.float64]
 RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
 LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
 LEAP = 1.5  # the next step may be longer than the last one by this factor
-NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # after steps longer than the first, residuals this near are held
+NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))
 LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 HEAVY = 3.0  # times the objective is what violations weigh where repairing them would not pay
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
+NEARLY = 0.02  # or lands first, where no more than this is violated
 NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; share of the promised gain
 LAST_STEPS = 3  # before a deadline land
 SHORTEST = 30.0  # weight of the proximal term in these: nothing but the shortest way to what is feasible counts
@@ -55,6 +55,7 @@ class Settings:
         funnel: First width of the funnel, a violation.
         far: A start that violates more is none.
         cost_tolerance: Relative change of the objective, promised and reached, below which it has settled.
+        near: After steps longer than the first number of a pair, residuals as near as its second one are held.
         violation_tolerance: Worst scaled violation of a feasible iterate.
         thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
     """
@@ -66,6 +67,7 @@ class Settings:
     funnel: float = 0.3
     far: float = np.inf
     cost_tolerance: float = 1e-3
+    near: tuple[tuple[float, float], ...] = NEAR
     violation_tolerance: float = 6e-4
     thin: int = 6
 
@@ -92,7 +94,30 @@ class Result:
     ended: bool
 
 
-def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, until: float = math.inf) -> Result:
+@dataclass
+class Deadline:
+    """When the steps of some iterations should be over.
+
+    Attributes:
+        until: As ``time.perf_counter`` counts [s].
+        longest: What the longest step so far took, and some more [s].
+    """
+
+    until: float
+    longest: float = 0.0
+
+    def allows(self, steps: int) -> bool:
+        """Whether there is time for as many steps."""
+        return time.perf_counter() + steps * self.longest <= self.until
+
+    def note(self, begun: float) -> None:
+        """Take note of a step that is over and begun at ``begun``."""
+        self.longest = max(self.longest, UNEVEN * (time.perf_counter() - begun))
+
+
+def minimise(
+    motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, deadline: Deadline | None = None
+) -> Result:
     """Minimise from x.
 
     Args:
@@ -100,17 +125,20 @@ def minimise(motion: Transcription, bounds: Bounds, x: Array, settings: Settings
         bounds: Bounds of its residuals.
         x: First variables, shape (nx,).
         settings: How to iterate.
-        until: When to be done, as ``time.perf_counter`` counts [s]: the last steps before it land on what is feasible.
+        deadline: When to be done: the last steps before it land on what is feasible.
     """
     descent = _Descent(motion, bounds, settings, x)
     feasible: Result | None = None
-    iteration, longest, begun = 0, 0.0, time.perf_counter()
-    while iteration < settings.max_iterations and not descent.ended and begun + longest <= until:
-        descent.landing = begun + LAST_STEPS * longest > until
+    iteration = 0
+    while iteration < settings.max_iterations and not descent.ended and (deadline is None or deadline.allows(1)):
+        begun = time.perf_counter()
+        descent.landing = deadline is not None and not deadline.allows(LAST_STEPS)
         iteration += 1
         descent.advance()
-        longest, begun = max(longest, UNEVEN * (time.perf_counter() - begun)), time.perf_counter()
-        if until < math.inf and descent.violation < settings.violation_tolerance:
+        if deadline is None:
+            continue
+        deadline.note(begun)
+        if descent.violation < settings.violation_tolerance:
             feasible = _cheaper(feasible, descent.result(iteration))
     last = descent.result(iteration)
     return last if descent.ended or feasible is None else replace(feasible, iterations=iteration)
@@ -162,7 +190,7 @@ class _Descent:
         """Try a step: take it, or know better for the next one."""
         settings = self._settings
         proximal = SHORTEST if self.landing else LANDING if self._settled else settings.proximal
-        near = next(near for length, near in NEAR if self._length > length)
+        near = next(near for length, near in settings.near if self._length > length)
         where = Near(self.violation, near, LEAP * self._length, self._missed, self._multipliers)
         model = self._steps.model(self.x, self._g, where, proximal=proximal, penalty=self._penalty)
         step = self._propose(model)
@@ -174,7 +202,10 @@ class _Descent:
             self._violations.append(self.violation)
         if self._is_stuck() and self._penalty < self.cost:  # breaking its limits may pay: it will not
             self._penalty, self._violations = HEAVY * self.cost, [self.violation]
-        self.ended |= self._radius < SMALLEST or self._is_stuck()
+        stuck = self._is_stuck()
+        if stuck and not self._settled and self.violation < NEARLY:  # it creeps along its limits, and is to land
+            stuck, self._settled, self._violations = False, True, [self.violation]
+        self.ended |= self._radius < SMALLEST or stuck
 
     def _is_stuck(self) -> bool:
         """Whether it was never feasible, and the least violation hardly falls any more."""

@@ -4,6 +4,7 @@ over the same compiled kernels.
 Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n
 joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
 
+#define NEAR_OTHERS 0.4 /* as quadratic.py has it */
 #define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
 
 typedef void kernel(long, const double *const *, const long *, double *const *);
@@ -293,8 +294,8 @@ static int objective(motion *s, const double *x, double proximal) {
   return factor(s, proximal);
 }
 
-/* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, that may leap
-over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
+/* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, or than
+NEAR_OTHERS where no acceleration is in them and that is less, that may leap over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
 void model(motion *s, const double *x, const double *g, double proximal, double near, double step,
            const unsigned char *missed, const double *multipliers, unsigned char *held) {
   long nx = s->nx, points = s->grid.points, width = s->grid.orders * s->n + s->grid.orders - 1, m = s->m;
@@ -304,7 +305,8 @@ void model(motion *s, const double *x, const double *g, double proximal, double 
   double *row = jacobian + width * m * TILE, J[width + s->grid.orders * W];
   memset(J, 0, sizeof J);
   EACH(i, 0, m * points) excess[i] = outside(s, g, i);
-  EACH(i, 0, m) crest(s, excess + i * points, near, held + i * points);
+  EACH(i, 0, m)
+    crest(s, excess + i * points, s->sharp[i * points] || near < NEAR_OTHERS ? near : NEAR_OTHERS, held + i * points);
   EACH(i, 0, m * points) held[i] |= missed[i];
   if (multipliers) EACH(i, 0, m * points) held[i] |= multipliers[i] != 0;
 
