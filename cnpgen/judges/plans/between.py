@@ -145,8 +145,8 @@ def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
 
 def _product(a: Array, b: Array) -> Array:
     """Multiply functions (n, S, i + 1) by one function (1, S, j + 1), piece by piece."""
-    outer = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:-1], -1)
-    return np.asarray(outer @ _products(a.shape[-1] - 1, b.shape[-1] - 1))
+    outer = (a[..., :, None] * b[..., None, :]).reshape(-1, a.shape[-1] * b.shape[-1])
+    return np.asarray((outer @ _products(a.shape[-1] - 1, b.shape[-1] - 1)).reshape(*a.shape[:-1], -1))
 
 
 @cache

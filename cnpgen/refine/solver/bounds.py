@@ -24,7 +24,7 @@ NEGLIGIBLE = 1e-5  # of scaled residuals: iterations end with larger violations 
 UNTOLD = 1e9  # so many scaled units are allowed where only the verdict can tell
 SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
 PRECISE = 0.1  # of an equality's tolerance is what plans should miss it by at most
-USED = 0.95  # of what residuals may be further outside between grid points, by what four of these say
+USED = 0.9  # of what residuals may be further outside between grid points, by what four of these say
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """Steps in compiled code, ``step.c`` and ``nearest.c``: those of NumPy and DAQP but for rounding, and much faster."""
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from ctypes import c_double, c_int, c_long, c_void_p
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -199,14 +200,23 @@ class CompiledSteps:
             "where": size,
             "first": size,
         }
-        return {name: self._keep(_aligned(size)) for name, size in sizes.items()}
+        return dict(zip(sizes, self._room(list(sizes.values())), strict=True))
 
     def _programme(self, stride: int) -> _Polyhedron:
         dim = self._nx + 1
         rows = dim + self._m * self._points + BLOCK
         scratch = (2 * dim + BLOCK) * stride + 8 * (stride + BLOCK)
         sizes = (rows * dim, rows, rows, rows, scratch, dim)  # rows, low, high, norm, scratch, active
-        return _Polyhedron(dim, stride, 0, *(self._keep(_aligned(size)) for size in sizes))
+        return _Polyhedron(dim, stride, 0, *self._room(sizes))
+
+    def _room(self, sizes: Sequence[int]) -> list[int]:
+        """Return where there is room for so many numbers each; it begins where lines of the cache do."""
+        lines = [size + -size % LINE for size in sizes]
+        array = np.empty(sum(lines) + LINE)
+        self._kept.append(array)
+        begin = address_of(array)
+        begin += -begin % (LINE * array.itemsize)
+        return [begin + array.itemsize * before for before in accumulate(lines, initial=0)][:-1]
 
     def _bases(self, bases: Bases) -> _Bases:
         orders, points, _ = bases.path.shape
@@ -217,13 +227,6 @@ class CompiledSteps:
         array = np.ascontiguousarray(array)
         self._kept.append(array)
         return address_of(array)
-
-
-def _aligned(size: int) -> Array:
-    """Make an array that begins where a line of the cache does."""
-    array = np.empty(size + LINE)
-    first = -(address_of(array) // array.itemsize) % LINE
-    return array[first : first + size]
 
 
 @dataclass(frozen=True)
