@@ -32,7 +32,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     """Lay out what is said of all plans together."""
     summary, count = found.summary(), len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
-    head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, looked at every {step} or more often"
+    head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, judged at steps of {step} and between them"
     tallies = [
         (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
         for name, text in _TALLIES.items()
