@@ -52,7 +52,9 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
     }
     decisions = {end: settle(context, end, exact=end not in given) for end in ends}
     hitting = context.kernels.load(direction_unmet, dtype=context.dtype) if "hit_angle" in written else None
-    reasons = [constraint.reason for constraint in context.problem.constraint]
+    constraints = len(context.problem.constraint)
+    reasons = [*(constraint.reason for constraint in context.problem.constraint), "tip not at its position"]
+    reasons += ["hit not along its direction"] if hitting is not None else []
     n = context.robot.n
 
     def work(draws: Round, _random: np.random.Generator) -> None:
@@ -65,17 +67,13 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
             state = draws[f"{end}_q"], draws[f"{end}_dq"], acceleration
             (count,) = kernels[end](*state, tops, draws[f"{end}_xyz"])
             if decide := decisions[end]:
-                count[: len(reasons)] += decide(state, tops, count.max(axis=0) <= 0)
+                count[:constraints] += decide(state, tops, count.max(axis=0) <= 0)
             missed.append(count)
-        met = np.maximum(*missed) <= 0
-        gates = list(zip([*reasons, "tip not at its position"], met, strict=True))
+        unmet = np.maximum(*missed)
         if hitting is not None:
-            (off,) = hitting(draws["goal_q"], draws["goal_dq"], draws["hit_angle"], draws["hit_speed"])
-            gates.append(("hit not along its direction", off[0] <= 0))
-        alive = draws.alive
-        for reason, ok in gates:
-            left = ok if len(draws.alive) == len(alive) else ok[np.searchsorted(alive, draws.alive)]
-            draws.reject(left, reason)
+            off = hitting(draws["goal_q"], draws["goal_dq"], draws["hit_angle"], draws["hit_speed"])
+            unmet = np.concatenate([unmet, *off])
+        draws.reject_first(unmet <= 0, reasons)
 
     return work
 

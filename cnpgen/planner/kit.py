@@ -113,7 +113,7 @@ class Kit:
             degree=motion.degree,
             columns={**(columns or {}), "start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
             sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
-            status=np.full(len(boundary), PlanStatus.UNKNOWN, np.uint8),
+            status=np.full(len(boundary), PlanStatus.UNKNOWN.value, np.uint8),
         )
 
 

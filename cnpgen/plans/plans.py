@@ -24,6 +24,8 @@ from cnpgen.trajectory.spec import MOST_DEGREE, MOST_POINTS
 
 Array = NDArray[np.float64]
 
+_NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # what a column cannot be called
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plans:
@@ -267,14 +269,14 @@ def _rows(plans: Plans) -> int:
     fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()
     lengths = [len(field) if field.ndim else 0 for field in fields]
-    if lengths.count(lengths[0]) == len(lengths):  # a tenth of the time of counting
+    if len(set(lengths)) == 1:  # a tenth of the time of counting
         return lengths[0]
     return Counter(lengths).most_common(1)[0][0]
 
 
 def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
     for name, values in plans.columns.items():
-        if name in {*FLOATS, *INTEGERS} or "/" in name or name in {"", "."}:
+        if name in _NO_COLUMNS or "/" in name:
             yield f"a column cannot be called {name!r}"
         if values.ndim not in {1, 2} or len(values) != rows:
             yield f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}"

@@ -105,8 +105,8 @@ class HittingVelocity(Stage):
             velocity, speed = kernel(draws["goal_q"], direction)
             factor = share(draws, random, speed)
             draws["goal_dq"], draws["hit_speed"], draws["hit_speed_max"] = velocity * factor, speed * factor, speed
-            solved = np.isfinite(velocity).all(0) & np.isfinite(speed[0])  # not where the Jacobian is singular
-            draws.reject(solved & (speed[0] >= self.min_speed), "no hitting velocity")
+            finite = np.isfinite(velocity.sum(axis=0) + speed[0])  # not where the Jacobian is singular
+            draws.reject(finite & (speed[0] >= self.min_speed), "no hitting velocity")
 
         return work
 

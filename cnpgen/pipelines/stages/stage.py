@@ -1,7 +1,7 @@
 """The contract of a stage, and the round of draws that stages work on."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -61,12 +61,22 @@ class Round:
 
     def reject(self, ok: Any, reason: str) -> None:
         """End the draws where ``ok`` (shape (n,)) is false under ``reason`` and drop them from every column."""
-        if reason not in self.reasons:
-            self.reasons.append(reason)
-            self.origins[reason] = self.stage
-        if np.count_nonzero(ok) == len(ok):  # a fifth of the time of all()
+        self.reject_first(ok[None], [reason])
+
+    def reject_first(self, met: Any, reasons: Sequence[str]) -> None:
+        """End the draws where a row of ``met`` (shape (reasons, n)) is false, under the reason of the first such row.
+
+        All reasons count as seen, in their order, whether they end a draw or not.
+        """
+        for reason in reasons:
+            if reason not in self.origins:
+                self.reasons.append(reason)
+                self.origins[reason] = self.stage
+        if met.all():
             return
-        self.fate[self.alive[~ok]] = 1 + self.reasons.index(reason)
+        numbers = np.array([1 + self.reasons.index(reason) for reason in reasons])
+        ok = met.all(axis=0)
+        self.fate[self.alive[~ok]] = numbers[met[:, ~ok].argmin(axis=0)]
         keep = np.flatnonzero(ok)
         self.alive = self.alive[keep]
         self.columns = {name: np.take(values, keep, axis=1) for name, values in self.columns.items()}
