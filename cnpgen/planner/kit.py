@@ -17,7 +17,6 @@ from cnpgen.planner.pacing import Pacing, make_pacing
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.problems.robot import load_robot
@@ -113,7 +112,7 @@ class Kit:
             degree=motion.degree,
             columns={**(columns or {}), "start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
             sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
-            status=np.full(len(boundary), PlanStatus.UNKNOWN.value, np.uint8),
+            status=np.zeros(len(boundary), np.uint8),  # unknown
         )
 
 

@@ -26,6 +26,8 @@ from cnpgen.store.field import Field
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
+REASONS = "no hitting configuration", "joint position limit at the goal"
+
 
 @dataclass(frozen=True, kw_only=True)
 class HittingConfiguration(Stage):
@@ -63,8 +65,7 @@ class HittingConfiguration(Stage):
             home = np.repeat(robot.base[:, None], n, axis=1) if self.near == "base" else draws[f"{self.near}_q"]
             direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
             draws["goal_q"], solved, value = search.solve(draws["goal_xyz"], direction, home)
-            draws.reject(solved, "no hitting configuration")
-            draws.reject(np.isfinite(value[solved]), "joint position limit at the goal")
+            draws.reject_first(np.array([solved, value > -np.inf]), REASONS)
 
         return work
 

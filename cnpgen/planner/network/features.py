@@ -36,7 +36,9 @@ class Features:
     def of(self, tasks: Tasks, dtype: str = "float32") -> Array:
         """Compute the features of N tasks, shape (N, F)."""
         raw = raw_features(tasks, self.blocks)
-        return ((raw - self.mean) * self.scale).astype(dtype)
+        raw -= self.mean
+        raw *= self.scale
+        return raw.astype(dtype)
 
 
 def usual_blocks(boundary: Boundary) -> tuple[str, ...]:
