@@ -95,9 +95,10 @@ class Kit:
             sample_id: Which samples these are, shape (N,); 0, 1, ... by default.
             columns: What else is known of the tasks, as ``Plans.columns``.
         """
-        tasks = self.prepare(boundary)
+        ends = ends_of(boundary)
+        tasks = self.prepare(boundary, ends=ends)
         given, tops = model.outputs(tasks), self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
-        (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
+        (path,) = self.path(ends, lanes(given.offsets), lanes(given.rate), lanes(tops))
         motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
         if self.pacing is not None:
             motion = self.pacing.paced(motion, tops)
