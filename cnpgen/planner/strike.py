@@ -73,12 +73,13 @@ def strike_tasks(
     place, target = _lanes("puck", puck, {2, 3}), _lanes("towards", towards, {2})
     angle = np.arctan2(target[1:] - place[1:2], target[:1] - place[:1])
     columns = [*parts, behind(place, angle, meeting), angle, numbers("share", share).reshape(1, -1)]
-    count = max(values.shape[1] for values in columns)
-    for name, values in zip(GIVEN, columns, strict=True):
-        if not values.size:
+    counts = {name: values.shape[1] for name, values in zip(GIVEN, columns, strict=True)}
+    most = max(counts.values())
+    for name, count in counts.items():
+        if count == 0:
             raise UsageError(f"{name} is of no strike")
-        if values.shape[1] not in {1, count}:
-            raise UsageError(f"{name} is given for {values.shape[1]:,} strikes, something else for {count:,}")
+        if count not in {1, most}:
+            raise UsageError(f"{name} is given for {count:,} strikes, something else for {most:,}")
     return completion(dict(zip(GIVEN, columns, strict=True)))
 
 

@@ -106,9 +106,10 @@ class _Search:
 
     def _hold(self, q: Array, value: Array, beyond: Array, hope: Array, *where: Array) -> None:
         """Where an optimum beyond the limits is better than those within, solve again on the limits, in place."""
-        some = np.flatnonzero(hope > value)
-        if len(some) == 0:
+        worth = hope > value
+        if not np.count_nonzero(worth):
             return
+        some = np.flatnonzero(worth)
         position, direction, home = (np.take(values, some, axis=1) for values in where)
         held, found = within_limits(self._robot, self._held, np.take(beyond, some, axis=1), position, direction, home)
         (reached,) = self._value(held, direction, home)
