@@ -82,10 +82,10 @@ class Model:
     def outputs(self, tasks: Tasks) -> Outputs:
         """Ask the network for N tasks: in float32 itself, sums and the exponential in float64."""
         given = forward(self._weights, self.features.of(tasks))
-        offsets = np.multiply(given.path, self.meaning.path_scale, dtype=np.float64)
+        offsets = self.meaning.path_scale * given.path.astype(np.float64)
         if tasks.correction is not None:
             offsets += tasks.correction.reshape(offsets.shape)
-        return Outputs(offsets, np.exp(given.log_rate, dtype=np.float64) / tasks.expected_time[:, None])
+        return Outputs(offsets, np.exp(given.log_rate.astype(np.float64)) / tasks.expected_time[:, None])
 
     @cached_property
     def _weights(self) -> Weights:

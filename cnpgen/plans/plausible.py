@@ -23,11 +23,12 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
         boundary: Boundary conditions, shape (N, n) each.
     """
     low, high = robot.position_lower, robot.position_upper
-    middle, furthest = (low + high) / 2, FAR * (high - low) / 2
     for name in ("start_q", "goal_q"):
         q = np.asarray(getattr(boundary, name))
-        far = np.abs(q - middle) > furthest
-        if np.count_nonzero(far):
+        if np.count_nonzero((low <= q) & (q <= high)) == q.size:
+            continue
+        far = np.abs(q - (low + high) / 2) > FAR * (high - low) / 2
+        if far.any():
             plan, joint = np.argwhere(far)[0]
             unit = unit_of(robot.units("rad"), int(joint))
             other = "millimetres" if unit == "m" else "degrees"
