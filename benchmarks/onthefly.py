@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
 from numpy.typing import NDArray
-from refiner_problems import make_each
+from refiner_problems import Made, make_each
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.boundary_problems import draw_boundary_problems
@@ -45,6 +45,7 @@ FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the fi
 MOMENTS = (0.05, 0.95)  # of T
 MOMENTS_REFINED = 4  # on every refined motion
 SPARE = 1.25  # problems drawn for each that is wanted: some first motions are not valid, some tasks have no answer
+SAME_TIME = 1e-9  # s: of the rest of a plan, by rounding
 FULL_SPEED = 0.2
 CONE = np.deg2rad(120)
 TABLE = np.array([[0.6, 1.3], [-0.45, 0.45]])  # m
@@ -152,25 +153,39 @@ def sets(count: int, seed: int) -> dict[str, Problems]:
 
 def measure(planner: Planner, problems: Problems, refined: int) -> dict[str, float]:
     """Plan, judge, refine some; also what replanning answers where the goal has not moved."""
-    found = measure_plans(planner.plan_batch(problems.boundary), refined)
-    if problems.executed is not None and problems.time is not None:
-        goal = {"goal_q": problems.boundary.goal_q, "goal_dq": problems.boundary.goal_dq}
-        answer = measure_plans(planner.replan(problems.executed, problems.time, **goal), refined)
-        found |= {f"replan, {what}": value for what, value in answer.items() if what != "problems"}
-    return found
+    plans = planner.plan_batch(problems.boundary)
+    made = refine_each(plans[:refined])
+    found = figures(plans, made)
+    if problems.executed is None or problems.time is None:
+        return found
+    goal = {"goal_q": problems.boundary.goal_q, "goal_dq": problems.boundary.goal_dq}
+    answers = planner.replan(problems.executed, problems.time, **goal)
+    others, left = refine_each(answers[:refined]), problems.executed.duration - problems.time
+    found |= {f"replan, {what}": value for what, value in figures(answers, others).items() if what != "problems"}
+    good = np.array([one.valid and other.valid for one, other in zip(made, others, strict=True)])
+    best = np.array([min(one.duration, other.duration) for one, other in zip(made, others, strict=True)])[good].mean()
+    return found | {
+        "replan, rests of the old plan": float((np.abs(answers.duration - left) < SAME_TIME).mean()),
+        "T / best refined of both": float(plans.duration[:refined][good].mean() / best),
+        "replan, T / best refined of both": float(answers.duration[:refined][good].mean() / best),
+    }
 
 
-def measure_plans(plans: Plans, refined: int) -> dict[str, float]:
-    """Judge plans, refine some."""
-    found = {"problems": len(plans), "valid alone": float(evaluate_plans(plans).valid.mean())}
-    some = plans[:refined]
+def refine_each(plans: Plans) -> list[Made]:
+    """Refine plans one by one, with one BLAS thread."""
     with one_thread():
-        made = make_each(some, DEFAULT)
+        return make_each(plans, DEFAULT)
+
+
+def figures(plans: Plans, made: list[Made]) -> dict[str, float]:
+    """Say how good plans are, and the first of them beside what was refined from them."""
     good = np.array([each.valid for each in made])
     after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
-    return found | {
+    return {
+        "problems": len(plans),
+        "valid alone": float(evaluate_plans(plans).valid.mean()),
         "valid refined": float(good.mean()),
-        "T / refined": float(some.duration[good].mean() / after[good].mean()),
+        "T / refined": float(plans.duration[: len(made)][good].mean() / after[good].mean()),
         "refine, median ms": median(ms),
         "refine, p95 ms": float(np.quantile(ms, 0.95)),
     }
