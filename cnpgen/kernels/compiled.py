@@ -33,8 +33,8 @@ from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
 
-_LATER = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # what call.c calls of Python
-FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w", *_LATER)
+_OPEN = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # call.c calls Python's functions
+FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w", *_OPEN)
 CALL = Path(__file__).with_name("call.c")
 LONG = 6000  # instructions: above, GCC's register allocator takes minutes at -O2 and gains nothing
 COMPILE_SECONDS = 3600  # what takes longer hangs; the largest kernels take minutes on a busy machine
