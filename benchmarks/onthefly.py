@@ -5,7 +5,8 @@ between 0.05 and 0.95 of their time T, where they are, off the table by what pla
 
 * "new puck": to a new puck, anywhere on the table, in a direction within 120 degrees of the way to it, at full speed in
   a fifth of the cases; the goal configuration is chosen close to where the arm is;
-* "same goal": to the goal of the motion;
+* "same goal": to the goal of the motion; as the network plans it, and as ``replan`` answers, which keeps the rest of
+  the motion where the network is not faster by 2 %;
 * "near the base": to goals of the dataset airhockey-hit at full speed, chosen close to the base configuration;
 * "another problem's": to goals of the dataset airhockey-replan, chosen close to other starts;
 * "on refined plans": as "new puck", from motions that were refined before they were executed;
@@ -18,12 +19,13 @@ Nothing was chosen by these seeds. The clock is CPU time, one BLAS thread. Goals
 """
 
 import argparse
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
-from refiner_problems import make_each
+from numpy.typing import NDArray
+from refiner_problems import Made, make_each
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.boundary_problems import draw_boundary_problems
@@ -43,6 +45,7 @@ FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the fi
 MOMENTS = (0.05, 0.95)  # of T
 MOMENTS_REFINED = 4  # on every refined motion
 SPARE = 1.25  # problems drawn for each that is wanted: some first motions are not valid, some tasks have no answer
+SAME_TIME = 1e-9  # s: of the rest of a plan, by rounding
 FULL_SPEED = 0.2
 CONE = np.deg2rad(120)
 TABLE = np.array([[0.6, 1.3], [-0.45, 0.45]])  # m
@@ -56,6 +59,25 @@ State = tuple[Any, Any, Any]
 Goals = dict[str, tuple[float, bool]]  # figure -> its goal, and whether that is the most rather than the least
 
 
+@dataclass(frozen=True)
+class Problems:
+    """N problems.
+
+    Attributes:
+        boundary: Their boundary conditions.
+        executed: The motions that they begin on, where these go to the same goals; else None.
+        time: Since when these are executed [s], shape (N,).
+    """
+
+    boundary: Boundary
+    executed: Plans | None = None
+    time: NDArray[np.float64] | None = None
+
+    def __getitem__(self, rows: NDArray[np.int64]) -> "Problems":
+        parts = (None if each is None else each[rows] for each in (self.executed, self.time))
+        return Problems(self.boundary[rows], *parts)
+
+
 def first_motions(count: int, seed: int) -> Plans:
     """Valid plans of the shipped planners, half for replans and half for hits."""
     parts = []
@@ -65,9 +87,14 @@ def first_motions(count: int, seed: int) -> Plans:
     return concatenate(parts)
 
 
-def states_of(plans: Plans, random: np.random.Generator) -> State:
+def moments_of(plans: Plans, random: np.random.Generator) -> NDArray[np.float64]:
     """One random moment of every plan."""
-    return states_at(plans, random.uniform(*MOMENTS, len(plans)) * plans.duration)
+    return random.uniform(*MOMENTS, len(plans)) * plans.duration
+
+
+def states_of(plans: Plans, random: np.random.Generator) -> State:
+    """Where every plan is at a random moment."""
+    return states_at(plans, moments_of(plans, random))
 
 
 def to_new_pucks(state: State, problem: ProblemRecord, random: np.random.Generator) -> Boundary:
@@ -88,6 +115,12 @@ def to_goals(state: State, goals: Boundary) -> Boundary:
     return Boundary(q, dq, ddq, goals.goal_q[: len(q)], goals.goal_dq[: len(q)])
 
 
+def to_same_goals(plans: Plans, random: np.random.Generator) -> Problems:
+    """Problems from moments of plans to their own goals."""
+    time = moments_of(plans, random)
+    return Problems(to_goals(states_at(plans, time), plans.boundary), plans, time)
+
+
 def full_speed_hits(count: int, seed: int) -> Boundary:
     """Hits of the dataset airhockey-hit, all of them at full speed."""
     recipe = load_dataset_recipe("airhockey-hit")
@@ -98,7 +131,7 @@ def full_speed_hits(count: int, seed: int) -> Boundary:
     return draw_boundary_problems(fast, count, seed=seed).boundary
 
 
-def sets(count: int, seed: int) -> dict[str, Boundary]:
+def sets(count: int, seed: int) -> dict[str, Problems]:
     """Make the six sets."""
     random, drawn = np.random.default_rng(seed), int(SPARE * count)
     progress(f"{drawn} first motions")
@@ -108,28 +141,51 @@ def sets(count: int, seed: int) -> dict[str, Boundary]:
     refined = refine_plans(plans[::MOMENTS_REFINED])
     executed = refined.plans[np.repeat(np.flatnonzero(refined.valid), MOMENTS_REFINED)]
     found = {
-        "new puck": to_new_pucks(states_of(plans, random), plans.problem, random),
-        "same goal": to_goals(states_of(plans, random), plans.boundary),
-        "near the base": to_goals(states_of(plans, random), full_speed_hits(drawn, seed + 2)),
-        "another problem's": to_goals(states_of(plans, random), others),
-        "on refined plans": to_new_pucks(states_of(executed, random), plans.problem, random),
-        "today's rows": draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary,
+        "new puck": Problems(to_new_pucks(states_of(plans, random), plans.problem, random)),
+        "same goal": to_same_goals(plans, random),
+        "near the base": Problems(to_goals(states_of(plans, random), full_speed_hits(drawn, seed + 2))),
+        "another problem's": Problems(to_goals(states_of(plans, random), others)),
+        "on refined plans": Problems(to_new_pucks(states_of(executed, random), plans.problem, random)),
+        "today's rows": Problems(draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary),
     }
-    return {name: boundary[random.permutation(len(boundary))[:count]] for name, boundary in found.items()}
+    return {name: each[random.permutation(len(each.boundary))[:count]] for name, each in found.items()}
 
 
-def measure(planner: Planner, boundary: Boundary, refined: int) -> dict[str, float]:
-    """Plan, judge, refine some."""
-    plans = planner.plan_batch(boundary)
-    found = {"problems": len(plans), "valid alone": float(evaluate_plans(plans).valid.mean())}
-    some = plans[:refined]
+def measure(planner: Planner, problems: Problems, refined: int) -> dict[str, float]:
+    """Plan, judge, refine some; also what replanning answers where the goal has not moved."""
+    plans = planner.plan_batch(problems.boundary)
+    made = refine_each(plans[:refined])
+    found = figures(plans, made)
+    if problems.executed is None or problems.time is None:
+        return found
+    goal = {"goal_q": problems.boundary.goal_q, "goal_dq": problems.boundary.goal_dq}
+    answers = planner.replan(problems.executed, problems.time, **goal)
+    others, left = refine_each(answers[:refined]), problems.executed.duration - problems.time
+    found |= {f"replan, {what}": value for what, value in figures(answers, others).items() if what != "problems"}
+    good = np.array([one.valid and other.valid for one, other in zip(made, others, strict=True)])
+    best = np.array([min(one.duration, other.duration) for one, other in zip(made, others, strict=True)])[good].mean()
+    return found | {
+        "replan, rests of the old plan": float((np.abs(answers.duration - left) < SAME_TIME).mean()),
+        "T / best refined of both": float(plans.duration[:refined][good].mean() / best),
+        "replan, T / best refined of both": float(answers.duration[:refined][good].mean() / best),
+    }
+
+
+def refine_each(plans: Plans) -> list[Made]:
+    """Refine plans one by one, with one BLAS thread."""
     with one_thread():
-        made = make_each(some, DEFAULT)
+        return make_each(plans, DEFAULT)
+
+
+def figures(plans: Plans, made: list[Made]) -> dict[str, float]:
+    """Say how good plans are, and the first of them beside what was refined from them."""
     good = np.array([each.valid for each in made])
     after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
-    return found | {
+    return {
+        "problems": len(plans),
+        "valid alone": float(evaluate_plans(plans).valid.mean()),
         "valid refined": float(good.mean()),
-        "T / refined": float(some.duration[good].mean() / after[good].mean()),
+        "T / refined": float(plans.duration[: len(made)][good].mean() / after[good].mean()),
         "refine, median ms": median(ms),
         "refine, p95 ms": float(np.quantile(ms, 0.95)),
     }
@@ -148,7 +204,7 @@ def rows_of(model: str, name: str, found: dict[str, float], goals: Goals) -> lis
     """Lay out what was found of a set, each figure beside its goal."""
     rows = []
     for what, value in found.items():
-        goal, at_most = goals.get(what, (None, False))
+        goal, at_most = goals.get(what.removeprefix("replan, "), (None, False))
         rows.append((model, name, what, f"{value:,.4g}", *verdict(value, goal, at_most=at_most)))
     return rows
 
@@ -156,6 +212,9 @@ def rows_of(model: str, name: str, found: dict[str, float], goals: Goals) -> lis
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument("--models", nargs="+", default=["airhockey-onthefly"], help="shipped ones or files")
+    parser.add_argument(
+        "--sets", nargs="+", choices=GOALS, default=list(GOALS), metavar="SET", help="which are measured"
+    )
     parser.add_argument("--problems", type=int, default=300, help="of each set")
     parser.add_argument("--refined", type=int, default=60, help="how many of them are refined")
     parser.add_argument("--seed", type=int, default=864_209_753, help="of the problems")
@@ -164,13 +223,13 @@ def options(parser: argparse.ArgumentParser) -> None:
 def main() -> None:
     """Run."""
     chosen = arguments(__doc__, options)
-    problems = sets(chosen.problems, chosen.seed)
+    problems = {name: each for name, each in sets(chosen.problems, chosen.seed).items() if name in chosen.sets}
     results: dict[str, Any] = {}
     for model in chosen.models:
         planner = Planner(model)
-        for name, boundary in problems.items():
+        for name, each in problems.items():
             progress(f"{model}: {name}")
-            results.setdefault(model, {})[name] = measure(planner, boundary, chosen.refined)
+            results.setdefault(model, {})[name] = measure(planner, each, chosen.refined)
     each = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
     rows = [row for model, name, found in each for row in rows_of(model, name, found, goals_of(name))]
     head = ("planner", "problems", "figure", "value", "goal", "")

@@ -1,6 +1,7 @@
 """Strikes on the fly, replanning to the same goal, and refining until a deadline.
 
-* A strike, from a puck to a plan: completing the task and planning, one at a time and 1,024 together.
+* A strike, from a puck to a plan: completing the task and planning, one at a time and 1,024 together; by a planner
+  whose rates are the network's, and by one that paces them.
 * Replanning to a goal that has not moved: what the network alone takes over what was left, and what is kept.
 * Refining until a deadline: valid plans and motion time, and how long it took.
 
@@ -28,7 +29,7 @@ from cnpgen.refine.engine import refine_part
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.plans import refine_plans
 
-NAME = "airhockey-replan"
+NAME, PACED = "airhockey-replan", "airhockey-onthefly"
 BATCH = 1024
 TARGET = np.array([2.49, 0.0])  # m, where pucks are sent
 GOALS = {(1, "completed"): 0.3, (1, "planned"): 0.3, (1, "both"): 0.6, (BATCH, "both"): 0.04}  # ms
@@ -115,6 +116,18 @@ def deadlines(given: Plans) -> list[dict[str, Any]]:
     return found
 
 
+def rows_of(name: str, found: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Lay out what strikes of a planner take."""
+    rows = []
+    for size in (1, BATCH):
+        for what in ("completed", "planned", "both"):
+            value = found[f"{size} {what}"]
+            ratio = f"{value / found[f'{size} planned']:.2f}"
+            aim = verdict(value, GOALS.get((size, what)), at_most=True)
+            rows.append((name, str(size), what, f"{value:.4f}", ratio, *aim))
+    return rows
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=300)
     parser.add_argument("--plans", type=int, default=100, help="of replanning and refining")
@@ -122,26 +135,24 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def main() -> None:
     chosen = arguments(__doc__, options)
+    struck = {}
+    for name in (NAME, PACED):
+        progress(f"striking: {name}")
+        struck[name] = strikes(Planner(name), chosen.repeat)
     planner = Planner(NAME)
-    progress("striking")
-    struck = strikes(planner, chosen.repeat)
     progress("replanning to the same goal")
     plans = planner.plan_batch(draw_boundary_problems(NAME, chosen.plans, seed=6).boundary)
     kept = plans[evaluate_plans(plans).valid]
     same = same_goal(planner, kept, "network") + same_goal(planner, refine_plans(kept).plans, "refined")
     progress("refining until deadlines")
     cut = deadlines(plans)
-    rows = []
-    for size in (1, BATCH):
-        for what in ("completed", "planned", "both"):
-            value = struck[f"{size} {what}"]
-            ratio = f"{value / struck[f'{size} planned']:.2f}"
-            rows.append(
-                (str(size), what, f"{value:.4f}", ratio, *verdict(value, GOALS.get((size, what)), at_most=True))
-            )
+    head = ("planner", "batch", "what", "ms", "of planning", "target", "")
     tables = [
-        table("strikes, ms each", ("batch", "what", "ms", "of planning", "target", ""), rows, left=2),
-        f"{struck['answered']:.1%} have an answer; {struck['valid']:.1%} of their plans are valid",
+        table("strikes, ms each", head, [row for item in struck.items() for row in rows_of(*item)], left=3),
+        *(
+            f"{name}: {found['answered']:.1%} have an answer; {found['valid']:.1%} of their plans are valid"
+            for name, found in struck.items()
+        ),
         table(
             "to the same goal, over what was left",
             ("plans", "at", "network, median", "valid", "replan, largest", "valid", "path points"),

@@ -33,33 +33,55 @@ from cnpgen.kernels.grid import GridKernel, check_grid
 from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
 
-FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w")
+_OPEN = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # call.c calls Python's functions
+FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w", *_OPEN)
+CALL = Path(__file__).with_name("call.c")
 LONG = 6000  # instructions: above, GCC's register allocator takes minutes at -O2 and gains nothing
 COMPILE_SECONDS = 3600  # what takes longer hangs; the largest kernels take minutes on a busy machine
 VERSION_SECONDS = 10
 _LOG = logging.getLogger(__name__)
 
 
-class CompiledKernel(Kernel):
-    """A tape as machine code."""
+class _Callee(ctypes.Structure):
+    """``callee`` of call.c."""
 
-    def __init__(self, tape: Tape, library: Path) -> None:
+    _fields_ = (
+        ("kernel", ctypes.c_void_p),
+        ("inputs", ctypes.c_long),
+        ("outputs", ctypes.c_long),
+        ("widths", ctypes.POINTER(ctypes.c_long)),
+    )
+
+
+class CompiledKernel(Kernel):
+    """A tape as machine code.
+
+    Args:
+        tape: The tape.
+        library: Its library.
+        cache_folder: Where libraries are kept, for the one that calls kernels.
+    """
+
+    def __init__(self, tape: Tape, library: Path, cache_folder: Path) -> None:
         super().__init__(tape)
-        self._function = _load(library)
+        self._address = ctypes.cast(_load(library), ctypes.c_void_p).value
+        sizes = len(tape.inputs), len(tape.outputs)
+        widths = (ctypes.c_long * sum(sizes))(*tape.inputs, *tape.outputs)
+        self._callee, self._call = _Callee(self._address, *sizes, widths), _load_call(cache_folder)
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
-        n = check_arguments(self.tape, arguments)
+        n = arguments[0].shape[-1]
         results = [np.empty((width, n)) for width in self.tape.outputs]
-        if n:
-            strides = _array_type(ctypes.c_long, len(arguments))(*[argument.strides[0] // 8 for argument in arguments])
-            self._function(ctypes.c_long(n), _pointers(arguments), strides, _pointers(results))
+        if not self._call(self._callee, arguments, results):
+            check_arguments(self.tape, arguments)
+            raise ValueError(f"kernel {self.tape.name}: arguments must be NumPy arrays")
         return results
 
     @property
     def address(self) -> int | None:
         """Where its machine code begins; see ``Kernel``."""
-        return ctypes.cast(self._function, ctypes.c_void_p).value
+        return self._address
 
 
 class CompiledGridKernel(GridKernel):
@@ -83,6 +105,18 @@ def _load(library: Path) -> Any:
     except (OSError, AttributeError) as error:
         raise MachineError(f"cannot load the compiled kernel {library}: {error}; delete it and run again") from error
     function.restype = None
+    return function
+
+
+@cache
+def _load_call(cache_folder: Path) -> Any:
+    """Return the function of call.c."""
+    library = compile_source([CALL], cache_folder)
+    try:
+        function = ctypes.PyDLL(str(library)).call
+    except OSError as error:
+        raise MachineError(f"cannot load {library}, which calls compiled kernels: {error}") from error
+    function.argtypes = (ctypes.POINTER(_Callee), ctypes.py_object, ctypes.py_object)
     return function
 
 

@@ -82,7 +82,7 @@ class KernelLibrary:
             return InterpretedKernel(tape)
         if self._compilers is not None:
             return self._compilers.kernel(tape)
-        return CompiledKernel(tape, compile_tape(tape, self.cache_folder))
+        return CompiledKernel(tape, compile_tape(tape, self.cache_folder), self.cache_folder)
 
     @contextmanager
     def compiling_together(self) -> Iterator[None]:
@@ -259,7 +259,7 @@ def _try_compiler(folder: Path) -> None:
     codes = np.array([CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]], np.int16)
     operands = np.array([0, 0, 1], np.int32)
     tape = Tape("selftest", (1,), (1,), codes, operands, np.zeros(3, np.int32), np.zeros(3))
-    kernel = CompiledKernel(tape, compile_tape(tape, folder))
+    kernel = CompiledKernel(tape, compile_tape(tape, folder), folder)
     (result,) = kernel(np.arange(5.0)[None])
     if not np.array_equal(result[0], 2 * np.arange(5.0)):
         raise MachineError("the C compiler makes wrong code: 2 x differs from x + x")

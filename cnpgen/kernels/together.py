@@ -19,13 +19,13 @@ MOST = 8  # compilers at once: each takes some 100 MB
 class PendingKernel(Kernel):
     """A kernel whose library is still being compiled; the first call waits for it."""
 
-    def __init__(self, tape: Tape, library: "Future[Path]") -> None:
+    def __init__(self, tape: Tape, library: "Future[Path]", cache_folder: Path) -> None:
         super().__init__(tape)
-        self._library = library
+        self._library, self._folder = library, cache_folder
 
     @cached_property
     def _compiled(self) -> CompiledKernel:
-        return CompiledKernel(self.tape, self._library.result())
+        return CompiledKernel(self.tape, self._library.result(), self._folder)
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate every lane; see ``Kernel``."""
@@ -56,11 +56,11 @@ class Compilers:
             MachineError: There is no working compiler or the cache folder cannot be used.
         """
         if found := find_compiled(tape, self._folder):
-            return CompiledKernel(tape, found)
+            return CompiledKernel(tape, found, self._folder)
         key = tape.to_bytes()
         if key not in self._jobs:
             self._jobs[key] = self._threads().submit(compile_tape, tape, self._folder)
-        return PendingKernel(tape, self._jobs[key])
+        return PendingKernel(tape, self._jobs[key], self._folder)
 
     def _threads(self) -> "ThreadPoolExecutor":
         from concurrent.futures import ThreadPoolExecutor

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.kernels.symbolic.linalg import Scalar, dot, subtract, symbols
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import sample_tops
@@ -40,6 +40,7 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
         A function that rejects, under each constraint's reason, what is not exactly a boundary problem.
     """
     ends: tuple[End, ...] = ("start", "goal")
+    hit = {"start": (), "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else ()}
     kernels = {
         end: context.kernels.load(
             boundary_unmet,
@@ -47,13 +48,14 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
             needs=2 if f"{end}_ddq" in written else 1,
             dtype=context.dtype,
             exact=end not in given,
+            hitting=bool(hit[end]),
         )
         for end in ends
     }
     decisions = {end: settle(context, end, exact=end not in given) for end in ends}
-    hitting = context.kernels.load(direction_unmet, dtype=context.dtype) if "hit_angle" in written else None
-    reasons = [constraint.reason for constraint in context.problem.constraint]
-    n = context.robot.n
+    n, constraints = context.robot.n, len(context.problem.constraint)
+    reasons = [*(constraint.reason for constraint in context.problem.constraint), "tip not at its position"]
+    reasons += ["hit not along its direction"] if hit["goal"] else []
 
     def work(draws: Round, _random: np.random.Generator) -> None:
         tops = sample_tops(context.problem, draws)
@@ -63,25 +65,24 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
             if acceleration is None:
                 acceleration = np.zeros((n, len(draws.alive)))
             state = draws[f"{end}_q"], draws[f"{end}_dq"], acceleration
-            (count,) = kernels[end](*state, tops, draws[f"{end}_xyz"])
+            (count,) = kernels[end](*state, tops, draws[f"{end}_xyz"], *(draws[name] for name in hit[end]))
             if decide := decisions[end]:
-                count[: len(reasons)] += decide(state, tops, count.max(axis=0) <= 0)
+                count[:constraints] += decide(state, tops, count[: constraints + 1].max(axis=0) <= 0)
             missed.append(count)
-        met = np.maximum(*missed) <= 0
-        gates = list(zip([*reasons, "tip not at its position"], met, strict=True))
-        if hitting is not None:
-            (off,) = hitting(draws["goal_q"], draws["goal_dq"], draws["hit_angle"], draws["hit_speed"])
-            gates.append(("hit not along its direction", off[0] <= 0))
-        alive = draws.alive
-        for reason, ok in gates:
-            left = ok if len(draws.alive) == len(alive) else ok[np.searchsorted(alive, draws.alive)]
-            draws.reject(left, reason)
+        start, goal = missed
+        np.maximum(start, goal[: len(start)], out=goal[: len(start)])
+        draws.reject_first(goal <= 0, reasons)
 
     return work
 
 
-def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True) -> Any:
+def boundary_unmet(
+    robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True, hitting: bool = False
+) -> Any:
     """Build ``(q, dq, ddq, tops, position) -> unmet``, positive where a boundary state is not exact or not a number.
+
+    That of a hit is ``(q, dq, ddq, tops, position, angle, speed) -> unmet``: the tip must move along the angle,
+    horizontally, at that speed.
 
     Conditions that ask for more than is meant are left to ``cnpgen.pipelines.undecided``.
 
@@ -93,9 +94,11 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
         dtype: How exactly (see ``EXACTNESS``).
         exact: Whether it must be exact; else it may be as far outside as motions may, and what only boundary states
             must meet is left out.
+        hitting: Whether it is a hit.
 
     Returns:
-        A function whose result has one row per constraint, in order, and one for the position of the tip.
+        A function whose result has one row per constraint, in order, one for the position of the tip, and one for the
+        hit if it is one.
     """
     import casadi as ca
 
@@ -114,23 +117,21 @@ def boundary_unmet(robot: "Robot", problem: Problem, *, end: End, needs: int, dt
         rows.append(count)
     miss = subtract(p, state.kinematics.tip)
     rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= EXACTNESS[dtype]["position"]))
-    return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, tops_sx, p_sx], [ca.vertcat(*rows)])
+    hit = [ca.SX.sym("angle"), ca.SX.sym("speed")] if hitting else []
+    rows += [_direction_unmet(state.tip_velocity, *hit, dtype=dtype)] if hit else []
+    return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, tops_sx, p_sx, *hit], [ca.vertcat(*rows)])
 
 
-def direction_unmet(robot: "Robot", *, dtype: str) -> Any:
-    """Build ``(q, dq, angle, speed) -> unmet``: the tip must move along the angle, horizontally, at that speed."""
+def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str) -> Scalar:
+    """Whether a tip's velocity is not along the angle, horizontally, at a speed."""
     import casadi as ca
 
-    names = (("q", robot.n), ("dq", robot.n), ("angle", 1), ("speed", 1))
-    (q_sx, q), (dq_sx, dq), (angle_sx, angle), (speed_sx, speed) = (symbols(name, width) for name, width in names)
-    zero = [0.0] * robot.n
-    velocity = SymbolicState(robot, q, dq, zero, [], (), None).tip_velocity
-    cosine, sine = ca.cos(angle[0]), ca.sin(angle[0])
+    cosine, sine = ca.cos(angle), ca.sin(angle)
     across = ca.fabs(cosine * velocity[1] - sine * velocity[0])
-    along = cosine * velocity[0] + sine * velocity[1] - speed[0]
+    along = cosine * velocity[0] + sine * velocity[1] - speed
     exact = EXACTNESS[dtype]
-    met = ca.logic_and(across <= exact["direction"] * speed[0] + ROUNDING, ca.fabs(along) <= exact["velocity"])
-    return ca.Function("direction", [q_sx, dq_sx, angle_sx, speed_sx], [ca.logic_not(met)])
+    met = ca.logic_and(across <= exact["direction"] * speed + ROUNDING, ca.fabs(along) <= exact["velocity"])
+    return ca.logic_not(met)
 
 
 def bookkeeping_fields() -> tuple[Field, ...]:

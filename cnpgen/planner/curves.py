@@ -9,6 +9,7 @@ start_q, start_dq, start_ddq, goal_q, goal_dq, and goal_ddq where the goal fixes
 
 from typing import TYPE_CHECKING, Any
 
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.planner.bending import bend
 from cnpgen.problems.problem import Problem
@@ -18,6 +19,16 @@ from cnpgen.trajectory.spline import end_derivatives
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
     from cnpgen.trajectory.spec import TrajectorySpec
+
+
+def tips_at_ends(robot: "Robot", *, fixed_at_goal: int) -> Any:
+    """Build ``ends -> (start position, goal position)`` of the tip [m]."""
+    import casadi as ca
+
+    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
+    q, _, _, goal_q, *_ = _split(ends, robot.n)
+    tips = [ca.vertcat(*forward_kinematics(robot.chain, each).tip) for each in (q, goal_q)]
+    return ca.Function("tips_at_ends", [ends_sx], tips)
 
 
 def line_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:

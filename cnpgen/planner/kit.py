@@ -17,7 +17,6 @@ from cnpgen.planner.pacing import Pacing, make_pacing
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.problems.robot import load_robot
@@ -96,25 +95,31 @@ class Kit:
             sample_id: Which samples these are, shape (N,); 0, 1, ... by default.
             columns: What else is known of the tasks, as ``Plans.columns``.
         """
-        tasks = self.prepare(boundary)
+        ends = ends_of(boundary)
+        tasks = self.prepare(boundary, ends=ends)
         given, tops = model.outputs(tasks), self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
-        (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
-        motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
-        if self.pacing is not None:
-            motion = self.pacing.paced(motion, tops)
-        if self.slowing is not None:
-            factor = self.slowing.factor(motion, tops)
-            motion = motion if factor.max(initial=1.0) <= 1 else motion.slower(factor)
+        (path,) = self.path(ends, lanes(given.offsets), lanes(given.rate), lanes(tops))
+        points, degree = rows(path, boundary.start_q.shape[1]), model.problem.trajectory.degree
         return Plans(
             problem=model.problem,
             boundary=boundary,
-            path_control_points=motion.path,
-            rate_control_points=motion.rate,
-            degree=motion.degree,
+            path_control_points=points,
+            rate_control_points=self._fitted(points, given.rate, degree, tops),
+            degree=degree,
             columns={**(columns or {}), "start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
             sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
-            status=np.full(len(boundary), PlanStatus.UNKNOWN, np.uint8),
+            status=np.zeros(len(boundary), np.uint8),  # unknown
         )
+
+    def _fitted(self, path: Array, rate: Array, degree: int, tops: Array) -> Array:
+        """Return the rates, fitted to the limits where that is wanted, shape (N, R)."""
+        if self.pacing is not None:
+            rate = self.pacing.paced(Motion(path, rate, degree), tops).rate
+        if self.slowing is not None:
+            motion = Motion(path, rate, degree)
+            factor = self.slowing.factor(motion, tops)
+            rate = rate if factor.max(initial=1.0) <= 1 else motion.slower(factor).rate
+        return rate
 
 
 def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at_goal: int = 2) -> Kit:

@@ -85,9 +85,8 @@ class Pacing(Speeds):
         else:
             self._pace_compiled(rate, coefficients)
         worst_before, worst = (self._worst(path, each, heights) for each in (motion.rate, rate))
-        kept = ~(worst <= np.maximum(worst_before, self._slack))
-        rate[kept] = motion.rate[kept]
-        return rate
+        better = worst <= np.maximum(worst_before, self._slack)
+        return np.where(better[:, None], rate, motion.rate)
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
@@ -106,6 +105,11 @@ class Pacing(Speeds):
         counts = (self.rate != 0).any(axis=0)
         return np.stack([counts.argmax(axis=0), len(counts) - counts[::-1].argmax(axis=0)], axis=1).astype(np.int64)
 
+    @cached_property
+    def _tables(self) -> tuple[Array, Array]:
+        """Basis of r and r' as pace.c takes them, shape (R, K) each."""
+        return np.ascontiguousarray(self.rate[0].T), np.ascontiguousarray(self.rate[1].T)
+
     def _coefficients(self, path: list[Array], heights: Array) -> list[Array]:
         """Return rest, linear, square and mixed of every row at every phase of N motions, shape (m, N K) each."""
         p, p1, p2 = path
@@ -121,17 +125,16 @@ class Pacing(Speeds):
 
     def _worst(self, path: list[Array], rate: Array, heights: Array) -> Array:
         """By how much the worst value of every motion is out, shape (N,)."""
-        rates = np.stack([(rate @ each.T).ravel() for each in self.rate])
-        (found,) = self.excess(np.concatenate([*path, rates, heights]))
+        rates = [(rate @ each.T).reshape(1, -1) for each in self.rate]
+        (found,) = self.excess(np.concatenate([*path, *rates, heights]))
         return np.asarray(found.reshape(len(rate), -1).max(axis=1))
 
     def _pace_compiled(self, rate: Array, coefficients: list[Array]) -> None:
         assert self.library is not None
         count, points = rate.shape
         phases, rows = self.rate.shape[1], len(self.lower)
-        table = np.ascontiguousarray(self.rate.transpose(0, 2, 1))
         scratch, kept = np.empty(5 * phases), [np.ascontiguousarray(each) for each in coefficients]
-        arrays = [*kept, *self._bounds, table[0], table[1], self._span]
+        arrays = [*kept, *self._bounds, *self._tables, self._span]
         numbers = (count, phases, rows, points, FIXED, points - FIXED, SWEEPS)
         where = [address_of(each) for each in arrays]
         self.library.pace(

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.kernels.symbolic.kinematics import tip_position
-from cnpgen.planner.curves import line_bend
+from cnpgen.planner.curves import line_bend, tips_at_ends
 from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
@@ -47,7 +46,7 @@ class Preparation:
         problem: The problem.
         velocity_limit: Planning limits [rad/s], shape (n,).
         acceleration_limit: Planning limits [rad/s^2], shape (n,).
-        tip: Kernel of ``symbolic.kinematics.tip_position``.
+        tips: Kernel of ``curves.tips_at_ends``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
     """
@@ -55,19 +54,23 @@ class Preparation:
     problem: Problem
     velocity_limit: Array
     acceleration_limit: Array
-    tip: Kernel
+    tips: Kernel
     line: Kernel | None
     expected_time: str = "distance"
 
-    def __call__(self, boundary: Boundary) -> Tasks:
-        """Prepare N tasks, in float64."""
-        ends = np.concatenate([boundary.start_q, boundary.goal_q])
-        (tips,) = self.tip(np.ascontiguousarray(ends.T))
-        start_xyz, goal_xyz = tips[:, : len(boundary)].T, tips[:, len(boundary) :].T
+    def __call__(self, boundary: Boundary, *, ends: Array | None = None) -> Tasks:
+        """Prepare N tasks, in float64.
+
+        Args:
+            boundary: Boundary conditions, shape (N, n) each.
+            ends: What ``ends_of`` gives of them, where that is known.
+        """
+        ends = ends_of(boundary) if ends is None else ends
+        start_xyz, goal_xyz = (tip.T for tip in self.tips(ends))
         time = self._time(boundary)
         correction = None
         if self.line is not None:
-            (change,) = self.line(ends_of(boundary), 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
+            (change,) = self.line(ends, 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
             correction = rows(change, boundary.start_q.shape[1])
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
 
@@ -106,4 +109,5 @@ def prepare_tasks(
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     line = load(line_bend) if steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
-    return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)
+    tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
+    return Preparation(problem, *limits, tips, line, expected_time)

@@ -71,14 +71,16 @@ def strike_tasks(
         raise UsageError(f"state must be positions, velocities and accelerations, got {len(state)} of something")
     parts = [_lanes(name, values, {n}) for name, values in zip(GIVEN, state, strict=False)]
     place, target = _lanes("puck", puck, {2, 3}), _lanes("towards", towards, {2})
-    angle = np.arctan2(target[1:] - place[1:2], target[:1] - place[:1])
-    columns = [*parts, behind(place, angle, meeting), angle, np.atleast_2d(numbers("share", share))]
-    count = max(values.shape[1] for values in columns)
-    for name, values in zip(GIVEN, columns, strict=True):
-        if not values.size:
+    way = target - place[:2]
+    angle = np.arctan2(way[1:], way[:1])
+    columns = [*parts, behind(place, angle, meeting), angle, numbers("share", share).reshape(1, -1)]
+    counts = {name: values.shape[1] for name, values in zip(GIVEN, columns, strict=True)}
+    most = max(counts.values())
+    for name, count in counts.items():
+        if count == 0:
             raise UsageError(f"{name} is of no strike")
-        if values.shape[1] not in {1, count}:
-            raise UsageError(f"{name} is given for {values.shape[1]:,} strikes, something else for {count:,}")
+        if count not in {1, most}:
+            raise UsageError(f"{name} is given for {count:,} strikes, something else for {most:,}")
     return completion(dict(zip(GIVEN, columns, strict=True)))
 
 
@@ -91,9 +93,11 @@ def boundary_of_tasks(tasks: TaskRound, fixed_at_goal: int) -> Boundary:
 def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
     """Return values of shape (w,) or (N, w) as (w, N)."""
     array = numbers(name, values)
-    if array.ndim not in {1, 2} or array.shape[-1] not in widths:
+    if array.ndim == 1:
+        array = array[None]
+    if array.ndim != 2 or array.shape[1] not in widths:
         expected = " or ".join(f"({width},) or (N, {width})" for width in sorted(widths))
-        raise UsageError(f"{name} must have shape {expected}, got {array.shape}")
-    if not math.isfinite(array.sum()) and not np.isfinite(array).all():
+        raise UsageError(f"{name} must have shape {expected}, got {np.shape(values)}")
+    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first in a third of the time
         raise UsageError(f"{name} must be finite, got {array}")
-    return array.reshape(-1, array.shape[-1]).T
+    return array.T

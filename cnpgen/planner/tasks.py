@@ -72,7 +72,7 @@ def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
         Shape (N,).
     """
     each: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
-    time: Array = np.maximum(each.max(axis=1), SHORTEST_TIME)
+    time: Array = each.max(axis=1, initial=SHORTEST_TIME)
     return time
 
 
@@ -100,5 +100,5 @@ def reaching_time(boundary: Boundary, velocity_limit: Array, acceleration_limit:
     turning = np.minimum(peak, fastest)
     cruise = np.maximum(way - (fastest**2 - squares) / acceleration_limit, 0.0) / fastest
     each: Array = (2 * turning - first - last) / acceleration_limit + np.where(peak > fastest, cruise, 0.0)
-    time: Array = np.maximum(each.max(axis=1), SHORTEST_REACH)
+    time: Array = each.max(axis=1, initial=SHORTEST_REACH)
     return time

@@ -24,6 +24,8 @@ from cnpgen.trajectory.spec import MOST_DEGREE, MOST_POINTS
 
 Array = NDArray[np.float64]
 
+_NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # what a column cannot be called
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plans:
@@ -64,9 +66,8 @@ class Plans:
 
     def __post_init__(self) -> None:
         integer("degree", self.degree, least=3, most=MOST_DEGREE)
-        mistake = next(_mistakes(self), None)
-        if mistake:
-            raise UsageError(mistake)
+        if next(_mistakes(self), None):
+            raise UsageError(next(_mistakes(self, _rows(self))))
 
     def __len__(self) -> int:
         return len(self.path_control_points)
@@ -228,14 +229,14 @@ def _parts(boundary: Boundary) -> list[Array | None]:
     return list(vars(boundary).values())
 
 
-def _mistakes(plans: Plans) -> Iterator[str]:
-    """Yield what is wrong with the shapes."""
+def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
+    """Yield what is wrong with the shapes, of as many plans as there are paths by default."""
     path, rate, degree = plans.path_control_points, plans.rate_control_points, plans.degree
     if path.ndim != 3:
         yield f"path_control_points must have shape (N, C, n), got {path.shape}"
         return
     _, points, n = path.shape
-    rows = _rows(plans)
+    rows = len(path) if rows is None else rows
     if len(path) != rows:
         yield f"path_control_points must have shape ({rows}, C, n) like the other fields, got {path.shape}"
     joints = len(plans.problem.joint_names)
@@ -266,15 +267,12 @@ def _rows(plans: Plans) -> int:
     fields: list[NDArray[Any]] = [part for part in _parts(plans.boundary) if part is not None]
     fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()
-    lengths = [len(field) if field.ndim else 0 for field in fields]
-    if lengths.count(lengths[0]) == len(lengths):  # a tenth of the time of counting
-        return lengths[0]
-    return Counter(lengths).most_common(1)[0][0]
+    return Counter(len(field) if field.ndim else 0 for field in fields).most_common(1)[0][0]
 
 
 def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
     for name, values in plans.columns.items():
-        if name in {*FLOATS, *INTEGERS} or "/" in name or name in {"", "."}:
+        if name in _NO_COLUMNS or "/" in name:
             yield f"a column cannot be called {name!r}"
         if values.ndim not in {1, 2} or len(values) != rows:
             yield f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}"

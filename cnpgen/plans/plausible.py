@@ -25,6 +25,8 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
     low, high = robot.position_lower, robot.position_upper
     for name in ("start_q", "goal_q"):
         q = np.asarray(getattr(boundary, name))
+        if np.count_nonzero((low <= q) & (q <= high)) == q.size:
+            continue
         far = np.abs(q - (low + high) / 2) > FAR * (high - low) / 2
         if far.any():
             plan, joint = np.argwhere(far)[0]

@@ -31,6 +31,8 @@ def obstacle_tops(problem: Problem | StoredProblem | str | Path, start_xyz: Arra
         UsageError: ``problem`` is none.
     """
     problem = as_problem(problem)
+    if not problem.obstacle:
+        return np.empty((*np.shape(start_xyz)[:-1], 0))
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
     return place_obstacles(problem.obstacle, bottoms)

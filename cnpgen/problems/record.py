@@ -67,7 +67,7 @@ class ProblemRecord(StoredProblem):
         """Name of the problem."""
         return str(self.content["name"])
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """The n planned joints."""
         return tuple(self.content["robot"]["joints"])

@@ -14,7 +14,7 @@ The numbers are what kernels and judges are told of obstacles, sample by sample.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ def count_numbers(obstacles: Sequence[Obstacle]) -> int:
 
 def number_slices(obstacles: Sequence[Obstacle]) -> list[slice]:
     """Say which of the numbers are those of each obstacle."""
-    ends = np.cumsum([0, *map(_count, obstacles)]).tolist()
+    ends = accumulate(map(_count, obstacles), initial=0)
     return [slice(*pair) for pair in pairwise(ends)]
 
 

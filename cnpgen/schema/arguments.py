@@ -62,6 +62,8 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
     Raises:
         UsageError: These are no real numbers, or rows of different lengths, or not in the memory of this process.
     """
+    if type(values) is np.ndarray and values.dtype == dtype:  # as most are
+        return values
     wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
     try:
         detached = values.detach() if hasattr(values, "detach") and not differentiable else values

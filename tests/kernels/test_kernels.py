@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -84,7 +85,7 @@ def kernel_of(function: ca.Function, backend: str, folder: Path, loop: Loop | No
     tape = tape_from_function(function, loop)
     if backend == "casadi":
         return MappedKernel(tape, function)
-    return InterpretedKernel(tape) if backend == "numpy" else CompiledKernel(tape, compile_tape(tape, folder))
+    return InterpretedKernel(tape) if backend == "numpy" else CompiledKernel(tape, compile_tape(tape, folder), folder)
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +211,35 @@ def test_rows_of_arguments_may_be_any_distance_apart(mixed, cache_folder, backen
 def test_arguments_that_do_not_fit_are_refused(mixed, cache_folder, backend, arguments):
     with pytest.raises(ValueError, match="mixed"):
         kernel_of(mixed, backend, cache_folder)(*arguments)
+
+
+@needs_compiler
+def test_arguments_may_be_read_only_or_begin_anywhere(mixed, cache_folder):
+    whole = np.random.default_rng(3).normal(size=(5, 9))
+    stored = np.frombuffer(b"\0" + whole.tobytes(), "f8", offset=1).reshape(5, 9)
+    assert not stored.flags.aligned
+    assert not stored.flags.writeable
+    kernel = kernel_of(mixed, "compiled", cache_folder)
+    for found, expected in zip(kernel(stored[:3], stored[3:]), kernel(whole[:3], whole[3:]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@needs_compiler
+def test_what_only_looks_like_an_array_is_refused_by_compiled_kernels(mixed, cache_folder):
+    array = np.zeros((3, 4))
+    alike = SimpleNamespace(shape=array.shape, dtype=array.dtype, strides=array.strides, size=array.size)
+    with pytest.raises(ValueError, match="mixed: arguments must be NumPy arrays"):
+        kernel_of(mixed, "compiled", cache_folder)(alike, np.zeros((2, 4)))
+
+
+@needs_compiler
+def test_threads_that_share_a_compiled_kernel_get_their_own_results(mixed, cache_folder):
+    kernel = kernel_of(mixed, "compiled", cache_folder)
+    x, p = np.random.default_rng(9).normal(size=(2, 3, 400_000))
+    expected = kernel(x, p[:2])
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: kernel(x, p[:2]), range(16)):
+            np.testing.assert_array_equal(found[0], expected[0])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -409,7 +439,7 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
         path = compile_tape(expected.tape, tmp_path)
         if needs and needs not in machine_flags():
             continue
-        found = CompiledKernel(expected.tape, path)(*arguments)
+        found = CompiledKernel(expected.tape, path, tmp_path)(*arguments)
         settled = np.ones(n, bool) if expected.tape.loop is None else found[1][0] < expected.tape.loop.tolerance
         assert settled.mean() > 0.9
         np.testing.assert_allclose(
@@ -515,7 +545,7 @@ for damage in (b"", whole[:4096], whole[: n - 1], zeroed, flipped, garbage):
     library.write_bytes(damage)
     again = compile_tape(tape, cache)
     assert again.read_bytes() == whole
-    state, error = CompiledKernel(tape, again)(np.ones((2, 3)), np.full((1, 3), 4.0))
+    state, error = CompiledKernel(tape, again, cache)(np.ones((2, 3)), np.full((1, 3), 4.0))
     assert np.allclose(state[0], 2.0)
 print("rebuilt")
 """
@@ -537,7 +567,7 @@ def test_a_library_without_a_kernel_is_a_machine_error(root, tmp_path):
     source.write_text("int nothing;\n")
     subprocess.run([find_compiler(), "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
     with pytest.raises(MachineError, match=r"cannot load the compiled kernel .*empty\.so"):
-        CompiledKernel(tape_from_function(root, ROOT), library)
+        CompiledKernel(tape_from_function(root, ROOT), library, tmp_path)
 
 
 @pytest.fixture
@@ -711,7 +741,7 @@ def test_without_a_working_compiler_the_compiled_backend_is_a_machine_error(own_
 
 @needs_compiler
 def test_a_compiler_that_makes_wrong_code_is_found_out(own_cache, monkeypatch):
-    monkeypatch.setattr(library_module, "CompiledKernel", lambda tape, _path: lambda x: [x])
+    monkeypatch.setattr(library_module, "CompiledKernel", lambda tape, _path, _folder: lambda x: [x])
     with pytest.raises(MachineError, match="wrong code"):
         choose_backend("compiled")
 

@@ -243,6 +243,23 @@ def test_every_rejected_draw_has_one_fate_and_leaves_every_column():
     np.testing.assert_array_equal(draws["x"], [[4, 6, 8]])
     np.testing.assert_array_equal(draws["y"], [[8, 12, 16]])
     np.testing.assert_array_equal(draws.drawn["x"], [np.arange(10)])
+
+
+def test_gates_together_reject_under_the_same_reasons_as_one_after_the_other():
+    names, met = ["first", "second", "first again", "none", "second"], np.random.default_rng(3).random((5, 200)) > 0.2
+    met[3] = True
+    together, one_by_one = Round(200), Round(200)
+    for draws in (together, one_by_one):
+        draws["x"] = np.arange(200.0)[None]
+        draws.reject(np.arange(200) % 7 != 0, "before")
+    together.reject_first(met[:, together.alive], names)
+    for name, ok in zip(names, met, strict=True):
+        one_by_one.reject(ok[one_by_one.alive], name)
+    assert together.reasons == one_by_one.reasons == ["before", "first", "second", "first again", "none"]
+    assert len(set(together.fate.tolist())) == 5
+    for name in ("fate", "alive"):
+        np.testing.assert_array_equal(getattr(together, name), getattr(one_by_one, name))
+    np.testing.assert_array_equal(together["x"], one_by_one["x"])
     assert "y" not in draws.drawn
 
 

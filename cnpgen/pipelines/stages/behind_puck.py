@@ -47,6 +47,6 @@ def behind(puck: Array, angle: Array, distance: float) -> Array:
         angle: Directions of the hits about world z [rad], shape (1, N).
         distance: How far [m].
     """
-    along = np.concatenate([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    along = np.concatenate([np.cos(angle), np.sin(angle), np.zeros(angle.shape)])
     moved: Array = puck - distance * along[: len(puck)]
     return moved

@@ -98,27 +98,28 @@ class HittingVelocity(Stage):
         return work
 
     def _solve(self, context: Context, share: Callable[[Round, np.random.Generator, Array], Array]) -> Work:
-        kernel = context.kernels.load(hitting_velocity)
+        kernel = context.kernels.load(hitting_velocity, slowest=self.min_speed)
 
         def work(draws: Round, random: np.random.Generator) -> None:
             direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
-            velocity, speed = kernel(draws["goal_q"], direction)
+            velocity, speed, found = kernel(draws["goal_q"], direction)
             factor = share(draws, random, speed)
             draws["goal_dq"], draws["hit_speed"], draws["hit_speed_max"] = velocity * factor, speed * factor, speed
-            solved = np.isfinite(velocity).all(0) & np.isfinite(speed[0])  # not where the Jacobian is singular
-            draws.reject(solved & (speed[0] >= self.min_speed), "no hitting velocity")
+            draws.reject(found[0] > 0, "no hitting velocity")
 
         return work
 
 
-def hitting_velocity(robot: "Robot") -> Any:
-    """Build the linear programme as an SX function ``(q, d) -> (dq, speed)``.
+def hitting_velocity(robot: "Robot", *, slowest: float) -> Any:
+    """Build the linear programme as an SX function ``(q, d) -> (dq, speed, found)``.
 
     Args:
         robot: The robot.
+        slowest: The least speed that is a hit [m/s].
 
     Returns:
-        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximises the tip's speed [m/s] along d.
+        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximises the tip's speed [m/s] along d; found is
+        1 if that is a hit, and 0 also where the Jacobian is singular and dq is not finite.
     """
     import casadi as ca
 
@@ -127,7 +128,10 @@ def hitting_velocity(robot: "Robot") -> Any:
     along = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
     across = [[d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian]
     velocity, speed = maximise(along, across, [float(x) for x in robot.velocity_limit])
-    return ca.Function("hitting_velocity", [q_sx, d_sx], [ca.vertcat(*velocity), speed])
+    found = ca.logic_and(slowest <= speed, speed < np.inf)
+    for each in velocity:
+        found = ca.logic_and(found, ca.fabs(each) < np.inf)
+    return ca.Function("hitting_velocity", [q_sx, d_sx], [ca.vertcat(*velocity), speed, found])
 
 
 def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:

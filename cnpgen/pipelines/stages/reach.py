@@ -1,10 +1,11 @@
 """Stage: the paper's ballistic reach rule, straight lines along the tip's velocity that must stay over the table."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, subtract, symbols
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
 from cnpgen.problems.constraints.table import Table
@@ -40,26 +41,39 @@ class BallisticReach(Stage):
         return ()
 
     def prepare(self, context: Context) -> Work:
-        """Look up the table."""
+        """Load the kernel."""
         table = context.constraint(Table)
+        sides = [[side.low, side.high] for side in (table.x, table.y)]
+        over = context.kernels.load(over_table, sides=sides)
 
         def work(draws: Round, _random: np.random.Generator) -> None:
             if self.start_time:
-                ahead = draws["start_xyz"] + self.start_time * draws["start_tip_velocity"]
-                draws.reject(over(table, ahead), "the start leaves the table")
+                way = self.start_time * draws["start_tip_velocity"][:2]
+                ahead, _ = over(draws["start_xyz"][:2], way)
+                draws.reject(ahead[0] > 0, "the start leaves the table")
             if self.goal_time:
-                way = self.goal_time * hit_velocity(draws)
-                position = draws["goal_xyz"][:2]
-                draws.reject(over(table, position + way) & over(table, position - way), "the hit leaves the table")
+                _, both = over(draws["goal_xyz"][:2], self.goal_time * hit_velocity(draws))
+                draws.reject(both[0] > 0, "the hit leaves the table")
 
         return work
 
 
-def over(table: Table, position: Array) -> NDArray[np.bool_]:
-    """Whether positions of shape (2 or 3, n) [m] are over the table's rectangle."""
-    x, y = position[:2]
-    inside: NDArray[np.bool_] = (table.x.low <= x) & (x <= table.x.high) & (table.y.low <= y) & (y <= table.y.high)
-    return inside
+def over_table(*, sides: list[list[float]]) -> Any:
+    """Build ``(p, way) -> (ahead, both)``: 1 where p + way, and where p + way and p - way, are over the table, else 0.
+
+    Args:
+        sides: Where the table's rectangle begins and ends along x and along y [m].
+    """
+    import casadi as ca
+
+    (p_sx, p), (way_sx, way) = symbols("p", 2), symbols("way", 2)
+
+    def is_over(position: Vec) -> Scalar:
+        inside = [ca.logic_and(low <= at, at <= high) for at, (low, high) in zip(position, sides, strict=True)]
+        return ca.logic_and(*inside)
+
+    ahead, behind = is_over(add(p, way)), is_over(subtract(p, way))
+    return ca.Function("over_table", [p_sx, way_sx], [ahead, ca.logic_and(ahead, behind)])
 
 
 def hit_velocity(draws: Round) -> Array:

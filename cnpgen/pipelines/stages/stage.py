@@ -1,7 +1,7 @@
 """The contract of a stage, and the round of draws that stages work on."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -61,12 +61,22 @@ class Round:
 
     def reject(self, ok: Any, reason: str) -> None:
         """End the draws where ``ok`` (shape (n,)) is false under ``reason`` and drop them from every column."""
-        if reason not in self.reasons:
-            self.reasons.append(reason)
-            self.origins[reason] = self.stage
-        if ok.all():
+        self.reject_first(ok[None], [reason])
+
+    def reject_first(self, met: Any, reasons: Sequence[str]) -> None:
+        """End the draws where a row of ``met`` (shape (reasons, n)) is false, under the reason of the first such row.
+
+        All reasons count as seen, in their order, whether they end a draw or not.
+        """
+        for reason in reasons:
+            if reason not in self.origins:
+                self.reasons.append(reason)
+                self.origins[reason] = self.stage
+        if np.count_nonzero(met) == met.size:  # a third of the time of all()
             return
-        self.fate[self.alive[~ok]] = 1 + self.reasons.index(reason)
+        numbers = np.array([1 + self.reasons.index(reason) for reason in reasons])
+        ok = met.all(axis=0)
+        self.fate[self.alive[~ok]] = numbers[met[:, ~ok].argmin(axis=0)]
         keep = np.flatnonzero(ok)
         self.alive = self.alive[keep]
         self.columns = {name: np.take(values, keep, axis=1) for name, values in self.columns.items()}
@@ -167,4 +177,5 @@ class TaskRound(Round):
 
     def why(self) -> tuple[str, ...]:
         """Return why each of the N tasks has no answer; empty where it has one."""
-        return tuple(("", *self.reasons)[fate] for fate in self.fate.tolist())
+        texts = ["", *self.reasons]
+        return tuple(texts[fate] for fate in self.fate.tolist())

@@ -36,7 +36,9 @@ class Features:
     def of(self, tasks: Tasks, dtype: str = "float32") -> Array:
         """Compute the features of N tasks, shape (N, F)."""
         raw = raw_features(tasks, self.blocks)
-        return ((raw - self.mean) * self.scale).astype(dtype)
+        raw -= self.mean
+        raw *= self.scale
+        return raw.astype(dtype)
 
 
 def usual_blocks(boundary: Boundary) -> tuple[str, ...]:
@@ -72,7 +74,8 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     Returns:
         float64, shape (N, F).
     """
-    return np.concatenate([_block(tasks, name) for name in blocks], axis=1, dtype=np.float64)
+    parts = [part for name in blocks for part in _block(tasks, name)]
+    return np.concatenate(parts, axis=1, dtype=np.float64)
 
 
 def count_features(blocks: tuple[str, ...], joints: int) -> int:
@@ -81,16 +84,15 @@ def count_features(blocks: tuple[str, ...], joints: int) -> int:
     return sum(widths[name] for name in blocks)
 
 
-def _block(tasks: Tasks, name: str) -> Array:
+def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
     boundary = tasks.boundary
-    if name in {*STATES, ARRIVAL}:
-        states: Array = getattr(boundary, name)
-        return states
+    if name in STATES or name == ARRIVAL:
+        return (getattr(boundary, name),)
     if name == "sin_cos":
         angles = np.concatenate([boundary.start_q, boundary.goal_q], axis=1)
-        return np.concatenate([np.sin(angles), np.cos(angles)], axis=1)
+        return np.sin(angles), np.cos(angles)
     if name == "tips":
-        return np.concatenate([tasks.start_xyz, tasks.goal_xyz], axis=1)
+        return tasks.start_xyz, tasks.goal_xyz
     if name == "expected_time":
-        return np.log(tasks.expected_time)[:, None]
+        return (np.log(tasks.expected_time)[:, None],)
     raise ValueError(f"no block of features is called {name!r}: expected one of {', '.join(BLOCKS)}")
