@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.plans import Refinement
 
-REFINING = ("objective", "weight", "max_iterations", "tolerance", "step", "deadline")  # what add_refining adds
+REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline")  # what add_refining adds
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
@@ -63,7 +63,6 @@ def add_refining(parser: Options) -> None:
         help="relative change of the objective below which it has settled (default: 1e-3; from nothing a tenth of it,"
         " among obstacles a twentieth)",
     )
-    option("--step", metavar="S", type=values.seconds, help="time between two looks (default: 1ms, which is the most)")
     option(
         "--deadline",
         metavar="S",

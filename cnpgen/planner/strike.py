@@ -18,7 +18,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.requests import drawing_stages
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.plans import Plans
-from cnpgen.schema.arguments import numbers
+from cnpgen.schema.arguments import number, numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -68,19 +68,22 @@ def strike_tasks(
     """Complete strikes; see ``Planner.strike``."""
     n = completion.context.robot.n
     if np.ndim(state[0]) == 0 or len(state) != 3:
-        raise UsageError(f"state must be positions, velocities and accelerations, got {len(state)} of something")
+        raise UsageError(f"state must be positions, velocities and accelerations, got {len(state)} values or arrays")
     parts = [_lanes(name, values, {n}) for name, values in zip(GIVEN, state, strict=False)]
     place, target = _lanes("puck", puck, {2, 3}), _lanes("towards", towards, {2})
     way = target - place[:2]
+    if not np.count_nonzero(way, axis=0).all():
+        raise UsageError(f"towards must be another place than the puck, got {target.T.tolist()} for both")
     angle = np.arctan2(way[1:], way[:1])
-    columns = [*parts, behind(place, angle, meeting), angle, numbers("share", share).reshape(1, -1)]
+    shares = _lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
+    columns = [*parts, behind(place, angle, number("meeting", meeting)), angle, shares]
     counts = {name: values.shape[1] for name, values in zip(GIVEN, columns, strict=True)}
     most = max(counts.values())
     for name, count in counts.items():
         if count == 0:
             raise UsageError(f"{name} is of no strike")
         if count not in {1, most}:
-            raise UsageError(f"{name} is given for {count:,} strikes, something else for {most:,}")
+            raise UsageError(f"{name} is given for {count:,} strikes, another argument for {most:,}")
     return completion(dict(zip(GIVEN, columns, strict=True)))
 
 

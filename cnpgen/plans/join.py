@@ -66,7 +66,8 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
     """Cut each of N plans at a moment and join it with the plan that follows it.
 
     Positions, velocities and accelerations go on without a jump, to 1e-9 in SI units: as they do where ``following``
-    was planned from the state at that moment (``Planner.replan``, ``Planner.strike``, ``refine_plans``).
+    was planned from the state at that moment (``Planner.replan``, ``Planner.strike``, ``refine_plans``). To that comes
+    what rounding of control points makes of plans of a few milliseconds.
 
     Args:
         first: N plans, or what was joined before.

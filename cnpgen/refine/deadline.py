@@ -8,7 +8,7 @@ import numpy as np
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import Candidate, Search, as_given, unusable
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.sqp import Deadline
+from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.task import Outcome, Refined, Task
 
 VERDICT = 5e-3  # s: what a verdict takes, until one was timed

@@ -48,7 +48,7 @@ def refine_part(plans: Plans, options: RefineOptions) -> list[Refined]:
         options: How to.
     """
     refiner = prepare(plans, options)
-    jury = _jury(plans.problem, plans.degree, options.step, get_ident())
+    jury = _jury(plans.problem, plans.degree, get_ident())
     if options.deadline is not None:
         return [refine_until(refiner, jury, task, options.deadline) for task in tasks_of(plans)]
     return [refine_task(refiner, jury, task) for task in tasks_of(plans)]
@@ -105,9 +105,9 @@ def _tasks(problem: "Problem", boundary: Boundary, start_xyz: Array, goal_xyz: A
 
 
 @lru_cache(maxsize=8)
-def _jury(record: ProblemRecord, degree: int, step: float, _thread: int) -> Jury:
+def _jury(record: ProblemRecord, degree: int, _thread: int) -> Jury:
     """Return the jury of a thread: Pinocchio's and Coal's memory is not to be shared."""
-    return Jury(*open_problem(record), degree=degree, step=step)
+    return Jury(*open_problem(record), degree=degree)
 
 
 @lru_cache(maxsize=2)

@@ -25,11 +25,10 @@ class Jury:
         problem: The problem.
         robot: Its robot.
         degree: Degree of the plans' splines.
-        step: Time step of the verdict [s].
     """
 
-    def __init__(self, problem: Problem, robot: "Robot", *, degree: int, step: float = 1e-3) -> None:
-        self._judge, self._degree = Judge(problem, robot, step=step), degree
+    def __init__(self, problem: Problem, robot: "Robot", *, degree: int) -> None:
+        self._judge, self._degree = Judge(problem, robot), degree
 
     def verdict(self, task: Task, path: Array, rate: Array) -> Verdict:
         """Judge path control points (C, n) and rate control points (R,) as a plan of the task, briefly."""

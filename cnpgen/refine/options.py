@@ -4,12 +4,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cnpgen.errors import UsageError, nearest
-from cnpgen.judges.plans.judge import check_step
 from cnpgen.refine.solver import sqp
 from cnpgen.refine.solver.criterion import OBJECTIVES
 from cnpgen.schema.arguments import integer, number
-
-COARSEST = 1e-3  # s: what is stored as valid was looked at as closely as ``cnpgen evaluate`` looks
 
 
 @dataclass(frozen=True)
@@ -23,7 +20,6 @@ class RefineOptions:
         max_iterations: Steps of the first pass; 0 only repairs plans by slowing them down.
         tolerance: Relative change of the objective below which it has settled: what follows only makes it feasible.
             From nothing a tenth of it counts, among obstacles a twentieth.
-        step: The verdict looks at moments no further apart than this [s], 1 ms at most.
         deadline: How long refining a plan may take [s]; None for as long as it takes. What comes of it then depends on
             the machine and on what else it does.
 
@@ -35,7 +31,6 @@ class RefineOptions:
     weight: float | None = None
     max_iterations: int = sqp.DEFAULT.max_iterations
     tolerance: float = sqp.DEFAULT.cost_tolerance
-    step: float = 1e-3
     deadline: float | None = None
 
     def __post_init__(self) -> None:
@@ -45,7 +40,6 @@ class RefineOptions:
         if self.weight is not None and number("weight", self.weight) < 0:
             raise UsageError(f"the weight of an objective must not be negative, got {self.weight}")
         integer("max_iterations", self.max_iterations, least=0)
-        check_step(number("step", self.step), COARSEST)
         if not 0 < number("tolerance", self.tolerance) < 1:
             raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
         if self.deadline is not None and number("deadline", self.deadline) <= 0:

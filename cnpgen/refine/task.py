@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Reason
-from cnpgen.refine.solver.sqp import Deadline
+from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.moment import states_at_times
 from cnpgen.trajectory.motion import Motion, States
+from cnpgen.trajectory.spline import end_derivatives
 
 Array = NDArray[np.float64]
 
 GAP = 1e-9  # rad, rad/s and rad/s^2: what rounding leaves where one motion begins in the state of another
+ROUNDING = 4 * np.finfo(float).eps  # of control points: in accelerations of motions of milliseconds that is more
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,19 @@ def _check_joint(before: Motion, after: Motion, begun: Array, begins: Array) -> 
         whole = f"from {begun[row]:.6g} to {begun[row] + duration[row]:.6g} s"
         raise UsageError(f"plan {row} cannot be cut at {begins[row]:.6g} s: what is cut lasts {whole}")
     left, right = states_at_times(before, cut), states_at_times(after, np.zeros_like(cut))
-    for name, unit, one, other in zip(("q", "dq", "ddq"), ("rad", "rad/s", "rad/s^2"), left, right, strict=True):
+    allowed = GAP + _rounding(before) + _rounding(after)
+    for name, unit, one, other, most in zip(
+        ("q", "dq", "ddq"), ("rad", "rad/s", "rad/s^2"), left, right, allowed, strict=True
+    ):
         gap = np.abs(other - one).max(axis=1)
-        if not (gap <= GAP).all():
-            row = int(np.argmax(np.nan_to_num(gap, nan=np.inf)))
-            text = f"{name} jumps by {gap[row]:.3g} {unit} at {begins[row]:.6g} s, expected at most {GAP:g}"
+        if not (gap <= most).all():
+            row = int(np.argmax(np.nan_to_num(gap - most, nan=np.inf)))
+            text = f"{name} jumps by {gap[row]:.3g} {unit} at {begins[row]:.6g} s, expected at most {most[row]:.3g}"
             raise UsageError(f"plan {row} cannot be joined: {text}")
+
+
+def _rounding(motion: Motion) -> Array:
+    """Estimate what rounding of control points makes of positions, velocities and accelerations, shape (3, N)."""
+    ends, largest = end_derivatives(motion.path.shape[1], motion.degree), motion.rate.max(axis=1)
+    orders = np.array([np.ones_like(largest), ends.eta * largest, ends.beta * largest**2])
+    return np.asarray(ROUNDING * np.abs(motion.path).max(axis=(1, 2)) * orders)

@@ -270,7 +270,7 @@ def test_refining_goes_on_where_it_was_interrupted(trained, tiny, tmp_path, caps
     assert len(load_plans(tmp_path / "p.h5")) == 4
 
 
-@pytest.mark.parametrize("words", [["--workers", "2"], ["--objective", "jerk"], ["--step", "2ms"]])
+@pytest.mark.parametrize("words", [["--workers", "2"], ["--objective", "jerk"], ["--tolerance", "1e-4"]])
 def test_options_of_refining_are_not_ignored_without_it(trained, tiny, tmp_path, capsys, words):
     plan = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(tmp_path / "p.h5"), *words]
     code, text = failing(capsys, plan)

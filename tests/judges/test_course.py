@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from cnpgen.judges.plans.course import course, course_at, jerks
+from cnpgen.judges.plans.course import Phases, course, course_at, jerks
 from cnpgen.trajectory.motion import Motion
 from tests.examples.plans import KNOTS, load
 from tests.examples.plans import course as reference
@@ -43,7 +43,7 @@ def test_bases_that_are_kept_give_the_same_states(jerk: bool) -> None:
     for points in (12, 17):  # of another number of control points, too
         motion = Motion(random.normal(size=(1, points, 3)), random.uniform(0.5, 1, (1, points + 2)))
         s = np.sort(random.uniform(size=31))
-        expected, found = course(motion, s, jerk=jerk), course_at(motion, tuple(s.tolist()), jerk=jerk)
+        expected, found = course(motion, s, jerk=jerk), course_at(motion, Phases(s), jerk=jerk)
         for name, values in vars(expected).items():
             assert (getattr(found, name) is None) == (values is None)
             if values is not None:

@@ -1,13 +1,19 @@
 """Smooth conditions between moments: their largest value does not depend on where one looks first."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.sampling import Samples
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline import basis
 from tests.conftest import some
 from tests.examples.plans import bent, course, load, raised
 
@@ -100,3 +106,23 @@ def test_tops_that_are_no_parabolas_between_three_samples_decide_as_any_other(
     top = shape(np.linspace(0, 1, 10_000_001)).max()
     survey = OfOneCondition(lambda s: 1 + 10 * (shape(s) - top) + by)
     assert (survey.largest() > 1) == (by > 0)
+
+
+def test_a_kink_of_the_torque_at_a_knot_of_either_spline_is_seen_at_first() -> None:
+    """Splines of degree 3 have accelerations with kinks: here one peak at a knot that lies between the other's."""
+    plan, points, rates, knot = load("hit"), 9, 16, 1 / 6
+    path = np.repeat(plan.robot.base[None, None], points, axis=1)
+    bumps = np.clip(1 - 6 * np.abs(np.arange(7) / 6 - knot), 0, None) - 0.5 * (np.abs(np.arange(7) - 1) == 1)
+    path[0, :, 1] += 300 * np.linalg.lstsq(basis(np.arange(7) / 6, points, 3, 2), bumps, rcond=None)[0]
+    motion = Motion(path, np.full((1, rates), 2.0), 3)
+    state = motion.at(np.array([0.0, 1.0]))
+    ends = Boundary(*(getattr(state, name)[:, k] for k in (0, 1) for name in ("q", "dq", "ddq")))
+    only = tuple(each for each in plan.problem.constraint if isinstance(each, JointTorque))
+    given = motion, ends, plan.start_xyz, plan.goal_xyz
+    margin = Judge(replace(plan.problem, constraint=only), plan.robot)(*given)[0].margins["joint torque"]
+    assert margin.phase == pytest.approx(knot, abs=1e-9)
+    share = margin.excess / margin.allowed
+    for by in (0.999, 1.001):
+        constraint = tuple(replace(each, tolerance=each.tolerance * share * by) for each in only)
+        judge = Judge(replace(plan.problem, constraint=constraint), plan.robot)
+        assert [judge(*given, brief=brief)[0].valid for brief in (True, False)] == [by > 1] * 2

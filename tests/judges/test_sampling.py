@@ -65,7 +65,7 @@ def test_a_coarser_step_takes_fewer_samples():
 
 
 def test_a_first_look_is_at_phases_in_every_span_near_both_ends_and_where_it_is_told() -> None:
-    phases = np.array(few_phases(13, frozenset([0.1234])))
+    phases = few_phases(13, frozenset([0.1234])).s
     assert (phases[0], phases[-1]) == (0, 1)
     assert np.all(np.diff(phases) > 0)
     assert 0.1234 in phases
@@ -78,6 +78,6 @@ def test_a_first_look_is_at_phases_in_every_span_near_both_ends_and_where_it_is_
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
 def test_a_table_of_few_cells_gives_the_times_as_well(label: str) -> None:
-    motion, phases = load(label).motion, np.array(few_phases(13))
+    motion, phases = load(label).motion, few_phases(13).s
     exact = motion.time_at(phases)[0]
     np.testing.assert_allclose(times(phases, time_table(motion.rate[0], 7, cells=FEW_CELLS)), exact, atol=2e-5)

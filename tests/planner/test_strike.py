@@ -81,11 +81,14 @@ def test_a_planner_that_has_struck_can_still_be_pickled(planner, state):
     ("arguments", "message"),
     [
         ((np.zeros(6), [1.0, 0.0], TARGET), "state must be positions, velocities and accelerations"),
-        (((np.zeros(6),) * 2, [1.0, 0.0], TARGET), "state must be positions, velocities and accelerations, got 2 of"),
+        (
+            ((np.zeros(6),) * 2, [1.0, 0.0], TARGET),
+            "state must be positions, .* got 2 values or arrays",
+        ),
         (((np.zeros(5),) * 3, [1.0, 0.0], TARGET), r"start_q must have shape \(6,\) or \(N, 6\), got \(5,\)"),
         (((np.zeros(6),) * 3, [1.0], TARGET), r"puck must have shape \(2,\) or \(N, 2\) or \(3,\) or \(N, 3\), got"),
         (((np.zeros(6),) * 3, [1.0, np.nan], TARGET), "puck must be finite"),
-        (((np.zeros((2, 6)),) * 3, np.ones((3, 2)), TARGET), "start_q is given for 2 strikes, something else for 3"),
+        (((np.zeros((2, 6)),) * 3, np.ones((3, 2)), TARGET), "start_q is given for 2 strikes, another argument for 3"),
         (((np.zeros((0, 6)),) * 3, np.ones((0, 2)), TARGET), "start_q is of no strike"),
     ],
 )
@@ -107,3 +110,12 @@ def test_models_of_other_tasks_or_of_unknown_rows_cannot_strike(planner):
     unknown = Planner(replace(planner.model, training={}))
     with pytest.raises(UsageError, match="does not say how the rows were drawn"):
         unknown.strike(state, [1.0, 0.0], TARGET)
+
+
+def test_what_gives_no_direction_or_is_no_number_is_refused(planner, state):
+    with pytest.raises(UsageError, match=r"towards must be another place than the puck, got \[\[1.0, 0.3\]\]"):
+        planner.strike(state, PUCKS[3], PUCKS[3])
+    with pytest.raises(UsageError, match="speed_share must be finite"):
+        planner.strike(state, PUCKS, TARGET, speed_share=np.nan)
+    with pytest.raises(UsageError, match="meeting must be a finite number, got nan"):
+        planner.strike(state, PUCKS, TARGET, meeting=np.nan)

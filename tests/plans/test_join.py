@@ -62,6 +62,16 @@ def test_what_follows_a_whole_plan_begins_at_its_end(planner):
     np.testing.assert_allclose(join_plans(first, second).duration, first.duration + second.duration)
 
 
+@pytest.mark.parametrize("share", [0.5, 0.95, 0.999])
+def test_what_is_left_of_a_plan_can_be_joined_to_it_however_short(planner, share):
+    """A control point of a motion of a third of a millisecond is exact to some 1e-5 rad/s^2."""
+    goals = draw_boundary_problems("airhockey-replan", 16, seed=5).boundary
+    first = planner.plan_batch(goals)
+    switch = share * first.duration
+    rest = planner.replan(first, switch, goal_q=goals.goal_q, goal_dq=goals.goal_dq)
+    assert len(join_plans(first, rest, at=switch)) == 16
+
+
 def test_a_jump_is_refused_with_its_size_place_and_time(three):
     first, second, _, switch, _ = three
     with pytest.raises(

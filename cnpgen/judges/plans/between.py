@@ -96,11 +96,16 @@ def _worth_halving(hull: Array, best: float, least: float) -> NDArray[np.bool_]:
 
 
 @cache
-def _edges(path_points: int, rate_points: int, degree: int) -> Array:
-    """Return the knots of both splines."""
+def knots(path_points: int, rate_points: int, degree: int) -> frozenset[float]:
+    """Return the knots of both splines of a motion."""
     spans = (path_points - degree, rate_points - degree)
-    knots = {round(k / count, 12): k / count for count in spans for k in range(count + 1)}
-    return np.array([knots[key] for key in sorted(knots)])
+    return frozenset({round(k / count, 12): k / count for count in spans for k in range(count + 1)}.values())
+
+
+@cache
+def _edges(path_points: int, rate_points: int, degree: int) -> Array:
+    """Return these in their order."""
+    return np.array(sorted(knots(path_points, rate_points, degree)))
 
 
 def in_bernstein_form(control: Array, degree: int, order: int, edges: Array) -> Array:

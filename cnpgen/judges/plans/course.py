@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from math import factorial
 
 import numpy as np
@@ -13,6 +13,17 @@ from cnpgen.trajectory.spline import basis, taylor
 
 Array = NDArray[np.float64]
 ORDERS = 3  # of the path, positions among them, that accelerations are made of; jerks take one more
+
+
+@dataclass(frozen=True, eq=False)
+class Phases:
+    """Phases at which many motions are evaluated.
+
+    Attributes:
+        s: Ascending, in [0, 1], shape (K,).
+    """
+
+    s: Array
 
 
 @dataclass(frozen=True)
@@ -51,24 +62,24 @@ def course(motion: Motion, s: Array, *, jerk: bool = False) -> Course:
     return _in_time(p, _derivatives(motion.rate[0, :, None], motion.degree, s, orders=orders - 1))
 
 
-def course_at(motion: Motion, phases: tuple[float, ...], *, jerk: bool = False) -> Course:
-    """Evaluate one motion like ``course``, at phases at which many are: the bases of splines there are kept."""
+def course_at(motion: Motion, phases: Phases, *, jerk: bool = False) -> Course:
+    """Evaluate one motion as ``course`` does, but for rounding; the bases of splines at these phases are kept."""
     orders = ORDERS + jerk
     points, rates = motion.path.shape[1], motion.rate.shape[1]
     p = motion.path[0].T @ _bases(points, motion.degree, orders, phases)
     r = motion.rate[0] @ _bases(rates, motion.degree, orders - 1, phases)
-    count = len(phases)
+    count = len(phases.s)
     return _in_time(
         [p[:, k * count : (k + 1) * count] for k in range(orders)],
         [r[k * count : (k + 1) * count] for k in range(orders - 1)],
     )
 
 
-@cache
-def _bases(points: int, degree: int, orders: int, phases: tuple[float, ...]) -> Array:
+@lru_cache(maxsize=8)
+def _bases(points: int, degree: int, orders: int, phases: Phases) -> Array:
     """Bases of a spline and of its derivatives, one after the other, shape (C, orders K)."""
-    s = np.array(phases)
-    return np.ascontiguousarray(np.concatenate([basis(s, points, degree, order) for order in range(orders)]).T)
+    found = [basis(phases.s, points, degree, order) for order in range(orders)]
+    return np.ascontiguousarray(np.concatenate(found).T)
 
 
 def jerks(motion: Motion, s: Array) -> Array:

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.judges.plans.between import polynomials
+from cnpgen.judges.plans.between import knots, polynomials
 from cnpgen.judges.plans.closer import look_closer
-from cnpgen.judges.plans.course import Course, course, course_at, jerks
+from cnpgen.judges.plans.course import Course, Phases, course, course_at, jerks
 from cnpgen.judges.plans.limits import is_proven, limit_margin
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
@@ -32,7 +32,7 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 LONGEST_STEP = 0.01  # s: looks further apart miss most of what a robot does in between
-_GLANCE = tuple(np.linspace(0, 1, 33).tolist())  # phases at which most plans that are not valid show it
+_GLANCE = Phases(np.linspace(0, 1, 33))  # phases at which most plans that are not valid show it
 
 
 def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
@@ -75,7 +75,7 @@ class Judge:
     Args:
         problem: The problem.
         robot: Its robot.
-        step: Time step [s].
+        step: Time step [s] of what is not brief.
 
     Raises:
         UsageError: The step is not positive, or above ``LONGEST_STEP``.
@@ -153,9 +153,10 @@ class _Plan:
         return int(max(self.motion.path.shape[1], self.motion.rate.shape[1])) - self.motion.degree
 
     @property
-    def kinks(self) -> frozenset[float]:
-        """Phases at which constraints change abruptly."""
-        return frozenset(s for constraint in self.problem.constraint for s in constraint.kinks)
+    def corners(self) -> frozenset[float]:
+        """Phases at which constraints change abruptly, and the knots, where derivatives of the motion do."""
+        kinks = (s for constraint in self.problem.constraint for s in constraint.kinks)
+        return knots(self.motion.path.shape[1], self.motion.rate.shape[1], self.motion.degree).union(kinks)
 
     def is_finite(self) -> bool:
         numbers = (self.motion.path, self.motion.rate, self.tops, self.goal_xyz, *vars(self.boundary).values())
@@ -216,7 +217,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     """Whether the ends, or a constraint at one of a few phases, are wrong."""
     if not plan.is_finite() or not plan.motion.runs_forward()[0]:
         return True
-    samples = Samples(np.array(_GLANCE), np.array(_GLANCE))
+    samples = Samples(_GLANCE.s, _GLANCE.s)
     states = course_at(plan.motion, _GLANCE, jerk=plan.problem.uses_jerk)
     if not states.is_finite():
         return True
@@ -234,7 +235,7 @@ def _look(plan: _Plan, step: float) -> tuple[Course, Samples, Array] | Verdict:
         return Verdict(fault)
     rate, degree = plan.motion.rate[0], plan.motion.degree
     table = time_table(rate, degree)
-    samples = sample(table, step, plan.spans, plan.kinks)
+    samples = sample(table, step, plan.spans, plan.corners)
     if samples is None:
         return _too_long(table)
     return course(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples, table
@@ -247,9 +248,10 @@ def _first_look(plan: _Plan) -> tuple[Course, Samples, Array] | Verdict:
     table = time_table(plan.motion.rate[0], plan.motion.degree, cells=FEW_CELLS)
     if not table[1, -1] < LONGEST:
         return _too_long(table)
-    phases = few_phases(plan.spans, plan.kinks)
-    s = np.array(phases)
-    return course_at(plan.motion, phases, jerk=plan.problem.uses_jerk), Samples(s, times(s, table)), table
+    phases, jerk = few_phases(plan.spans, plan.corners), plan.problem.uses_jerk
+    exact = any(each.tolerance == 0 for each in plan.problem.constraint)  # then rounding decides: that of ``_look``
+    states = course(plan.motion, phases.s, jerk=jerk) if exact else course_at(plan.motion, phases, jerk=jerk)
+    return states, Samples(phases.s, times(phases.s, table)), table
 
 
 def _fault(plan: _Plan) -> Reason | None:

@@ -9,7 +9,7 @@ is divided, and its parts again, whose differences tell more.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +118,7 @@ def _tops(s: Array, values: Array) -> Array:
     return np.asarray(np.maximum(values[:, 1:], values[:, :-1]) + over**2 / (4 * sag))
 
 
-@cache
+@lru_cache(maxsize=2)
 def _neighbours(count: int) -> Indices:
-    """For each interval between so many samples, the samples at its ends and next to these that are no ends of all."""
+    """For each interval between so many samples, which four second differences are around it, shape (4, count - 1)."""
     return np.asarray(np.clip(np.arange(-2, 2)[:, None] + np.arange(count - 1), 0, count - 3))

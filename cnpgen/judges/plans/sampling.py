@@ -2,11 +2,12 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.course import Phases
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
@@ -96,9 +97,9 @@ def sample(table: Array, step: float, spans: int, also: Collection[float] = ()) 
     return Samples(s, times(s, table))
 
 
-@cache
-def few_phases(spans: int, also: frozenset[float] = frozenset()) -> tuple[float, ...]:
-    """Return the phases of a first look, ascending: ``FEW_PER_SPAN`` in every span and ``FEW_AT_ENDS`` near each end.
+@lru_cache(maxsize=8)
+def few_phases(spans: int, also: frozenset[float] = frozenset()) -> Phases:
+    """Return the phases of a first look: ``FEW_PER_SPAN`` in every span and ``FEW_AT_ENDS`` near each end.
 
     They are the same for all motions, however long these take.
 
@@ -106,7 +107,7 @@ def few_phases(spans: int, also: frozenset[float] = frozenset()) -> tuple[float,
         spans: Number of intervals between the knots of the finer spline.
         also: Further phases.
     """
-    return tuple(np.unique(_phases(FEW_PER_SPAN * spans, FEW_AT_ENDS, also)).tolist())
+    return Phases(np.unique(_phases(FEW_PER_SPAN * spans, FEW_AT_ENDS, also)))
 
 
 def _phases(evenly: int, at_ends: int, also: Collection[float]) -> Array:

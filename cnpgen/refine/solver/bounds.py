@@ -24,7 +24,7 @@ NEGLIGIBLE = 1e-5  # of scaled residuals: iterations end with larger violations 
 UNTOLD = 1e9  # so many scaled units are allowed where only the verdict can tell
 SOONER = 1.03  # funnels close that much sooner: motions overshoot where they turn level
 PRECISE = 0.1  # of an equality's tolerance is what plans should miss it by at most
-USED = 0.9  # of what residuals may be further outside between grid points, by what four of these say
+FULL = 0.9  # of what residuals may be beyond their bounds between grid points, by what four of these say
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,19 @@ class Bounds:
         upper: Shape (K, m).
         sharp: Which residuals leap with the last rate control points, shape (K, m): those of accelerations and jerks at
             the ends.
-        spare: How far beyond them residuals may be between grid points, shape (K, m): as far as the verdict allows, or
-            is precise where they are equalities; inf where nothing is known.
+        spare: How far beyond them residuals may be between grid points, shape (K, m): as far as the verdict allows, or,
+            where they are equalities, as is precise beside what their ends miss; inf where nothing is known.
     """
 
     lower: Array
     upper: Array
     sharp: NDArray[np.bool_]
     spare: Array
+
+    @property
+    def accelerated(self) -> NDArray[np.bool_]:
+        """Which residuals accelerations or jerks are in, shape (m,)."""
+        return np.asarray(self.sharp.any(axis=0))
 
     def excess(self, g: Array) -> Array:
         """How far residuals g are outside, shape (K, m); negative inside."""
@@ -89,7 +94,7 @@ class Bounds:
         """
         middle = sum(weights[:, None] * g[k : k + len(midway)] for k, weights in enumerate(midway.T))
         left, right = slice(1, -2), slice(2, -1)  # of the intervals between the second and the last but one
-        spare = USED * np.minimum(self.spare[left], self.spare[right])
+        spare = FULL * np.minimum(self.spare[left], self.spare[right])
         above = middle - np.maximum(self.upper[left], self.upper[right]) - spare
         below = np.minimum(self.lower[left], self.lower[right]) - middle - spare
         if not (above.max() > 0 or below.max() > 0):
@@ -136,9 +141,9 @@ class BoundsTemplate:
         widths = [len(each.g) for each in self.conditions]
         self.needs = np.repeat(needs, widths)
         self.capsules = np.repeat([isinstance(each, RobotClearance | SelfClearance) for each, _ in pairs], widths)
-        equal = np.repeat([each.is_equality for each in self.conditions], widths)
+        self._equal = np.repeat([each.is_equality for each in self.conditions], widths)
         with np.errstate(invalid="ignore"):
-            spare = np.where(equal, PRECISE, 1.0) * self.allowed + np.fmax(
+            spare = np.where(self._equal, PRECISE, 1.0) * self.allowed + np.fmax(
                 np.concatenate([high for _, high in loose], axis=1) - self._upper,
                 self._lower - np.concatenate([low for low, _ in loose], axis=1),
             )
@@ -186,7 +191,9 @@ class BoundsTemplate:
                 upper = np.asfortranarray(upper + np.minimum(above, self.allowed) * open_)
             if np.any(below > 0):
                 lower = np.asfortranarray(lower - np.minimum(below, self.allowed) * open_)
-        return Bounds(lower, upper, bounds.sharp, bounds.spare)
+        with np.errstate(invalid="ignore"):
+            wider = np.nan_to_num(np.fmax(upper - bounds.upper, bounds.lower - lower))
+        return Bounds(lower, upper, bounds.sharp, bounds.spare - np.where(self._equal, 0.0, wider))
 
     def _of(self, start_tip: Array) -> Bounds:
         lower, upper = self._lower, self._upper

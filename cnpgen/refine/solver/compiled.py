@@ -21,6 +21,7 @@ from cnpgen.refine.solver.quadratic import (
     CHANGES,
     FEASIBLE,
     MULTIPLIER,
+    NEAR_OTHERS,
     SOFTNESS,
     USED,
     Mask,
@@ -64,7 +65,7 @@ class _Motion(ctypes.Structure):
         *((name, c_void_p) for name in ("values", "jacobian", "criterion")),
         *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
         *((name, c_void_p) for name in ("top", "quadrature", "weights", "criterion_weights", "smooth")),
-        *((name, c_void_p) for name in ("lower", "upper", "sharp")),
+        *((name, c_void_p) for name in ("lower", "upper", "sharp", "accelerated")),
         *((name, c_void_p) for name in ("control", "rates", "slope", "w", "gradient", "hessian", "factor", "scratch")),
         *((name, c_void_p) for name in ("where", "first")),
         ("programme", _Polyhedron),
@@ -79,7 +80,7 @@ def load_steps(kernels: KernelLibrary) -> ctypes.CDLL | None:
     library = kernels.load_source(*SOURCES)
     if library is not None:
         library.look.argtypes, library.look.restype = (c_void_p,) * 3, c_double
-        library.model.restype, library.model.argtypes = None, (*(c_void_p,) * 3, *(c_double,) * 3, *(c_void_p,) * 3)
+        library.model.restype, library.model.argtypes = None, (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
         solve = (*(c_void_p,) * 3, c_double, c_double, c_int, c_void_p, c_double, c_double, c_int, c_void_p, c_void_p)
         library.solve.argtypes = solve
     return library
@@ -116,7 +117,7 @@ class CompiledSteps:
         before = None if near.multipliers is None else np.ascontiguousarray(near.multipliers.T)
         addresses = address_of(missed), None if before is None else address_of(before), address_of(held)
         self._motion.violation = near.violation
-        self._model(self._at, address_of(x), address_of(g.T), proximal, near.near, near.leap, *addresses)
+        self._model(self._at, address_of(x), address_of(g.T), proximal, near.near, NEAR_OTHERS, near.leap, *addresses)
         plain = partial(self._plain.model, x, g, near, proximal=proximal, penalty=penalty)
         return CompiledModel(self, plain, g, held.T, penalty * near.violation + USED)
 
@@ -166,6 +167,7 @@ class CompiledSteps:
             "lower": bounds.lower.T,
             "upper": bounds.upper.T,
             "sharp": bounds.sharp.T,
+            "accelerated": bounds.accelerated,
         }
         found: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in said.items()}
         found |= {"grid": self._bases(grid.bases), "nodes": self._bases(grid.criterion)}
@@ -210,7 +212,7 @@ class CompiledSteps:
         return _Polyhedron(dim, stride, 0, *self._room(sizes))
 
     def _room(self, sizes: Sequence[int]) -> list[int]:
-        """Return where there is room for so many numbers each; it begins where lines of the cache do."""
+        """Return addresses of memory for so many numbers each, at beginnings of the cache's lines."""
         lines = [size + -size % LINE for size in sizes]
         array = np.empty(sum(lines) + LINE)
         self._kept.append(array)

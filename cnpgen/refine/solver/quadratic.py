@@ -218,7 +218,7 @@ def choose(g: Array, bounds: Bounds, *, thin: int, near: float, leaps: Array) ->
         leaps: How far sharp residuals may leap, shape (K, m).
     """
     excess = bounds.excess(g)
-    within = np.where(bounds.sharp[0], near, min(near, NEAR_OTHERS))
+    within = np.where(bounds.accelerated, near, min(near, NEAR_OTHERS))
     picked: Mask = (crests(excess, thin=thin) & (excess > -within)) | (bounds.sharp & (excess > -leaps))
     return picked
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.compiled import CompiledSteps
+from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.quadratic import Mask, Model, Near, PlainSteps, Step, Steps, crests
 from cnpgen.refine.solver.transcription import Transcription
 
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
 LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
 LEAP = 1.5  # the next step may be longer than the last one by this factor
-NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))
+NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # see ``Settings.near``
 LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 HEAVY = 3.0  # times the objective is what violations weigh where repairing them would not pay
@@ -37,7 +38,6 @@ NEARLY = 0.02  # or lands first, where no more than this is violated
 NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; share of the promised gain
 LAST_STEPS = 3  # before a deadline land
 SHORTEST = 30.0  # weight of the proximal term in these: nothing but the shortest way to what is feasible counts
-UNEVEN = 1.3  # times the longest step that there was is left for the next
 LOOKS = 2  # between the points of the grid that may call for tighter bounds
 ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
 
@@ -94,27 +94,6 @@ class Result:
     ended: bool
 
 
-@dataclass
-class Deadline:
-    """When the steps of some iterations should be over.
-
-    Attributes:
-        until: As ``time.perf_counter`` counts [s].
-        longest: What the longest step so far took, and some more [s].
-    """
-
-    until: float
-    longest: float = 0.0
-
-    def allows(self, steps: int) -> bool:
-        """Whether there is time for as many steps."""
-        return time.perf_counter() + steps * self.longest <= self.until
-
-    def note(self, begun: float) -> None:
-        """Take note of a step that is over and begun at ``begun``."""
-        self.longest = max(self.longest, UNEVEN * (time.perf_counter() - begun))
-
-
 def minimise(
     motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, deadline: Deadline | None = None
 ) -> Result:
@@ -138,6 +117,7 @@ def minimise(
         if deadline is None:
             continue
         deadline.note(begun)
+        feasible = None if descent.tightened else feasible  # bounds hid what lies between the points of the grid
         if descent.violation < settings.violation_tolerance:
             feasible = _cheaper(feasible, descent.result(iteration))
     last = descent.result(iteration)
@@ -162,9 +142,11 @@ class _Descent:
         violation: Worst violation there.
         ended: Whether there is nothing more to gain.
         landing: Whether all that is still wanted is to become feasible.
+        tightened: Whether the last step made bounds tighter, for residuals outside between the points of the grid.
     """
 
     landing = False
+    tightened = False
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
         self._steps, self._motion, self._looks = steps_of(motion, bounds, settings.thin), motion, LOOKS
@@ -179,7 +161,7 @@ class _Descent:
         self._radius, self._funnel, self._penalty = settings.radius, settings.funnel, settings.penalty
         self._length = LARGEST  # of the last step, in the same norm
         self._multipliers: Array | None = None
-        self._settled = False
+        self._settled = self._creeps = False  # the second: along its limits, which it does not come to meet
         self._missed = np.zeros(self._g.shape, bool)  # residuals that a rejected step broke unseen
 
     def result(self, iterations: int) -> Result:
@@ -188,8 +170,8 @@ class _Descent:
 
     def advance(self) -> None:
         """Try a step: take it, or know better for the next one."""
-        settings = self._settings
-        proximal = SHORTEST if self.landing else LANDING if self._settled else settings.proximal
+        settings, self.tightened = self._settings, False
+        proximal = SHORTEST if self.landing else LANDING if self._settled or self._creeps else settings.proximal
         near = next(near for length, near in settings.near if self._length > length)
         where = Near(self.violation, near, LEAP * self._length, self._missed, self._multipliers)
         model = self._steps.model(self.x, self._g, where, proximal=proximal, penalty=self._penalty)
@@ -202,10 +184,9 @@ class _Descent:
             self._violations.append(self.violation)
         if self._is_stuck() and self._penalty < self.cost:  # breaking its limits may pay: it will not
             self._penalty, self._violations = HEAVY * self.cost, [self.violation]
-        stuck = self._is_stuck()
-        if stuck and not self._settled and self.violation < NEARLY:  # it creeps along its limits, and is to land
-            stuck, self._settled, self._violations = False, True, [self.violation]
-        self.ended |= self._radius < SMALLEST or stuck
+        if self._is_stuck() and not self._creeps and self.violation < NEARLY:
+            self._creeps, self._violations = True, [self.violation]
+        self.ended |= self._radius < SMALLEST or self._is_stuck()
 
     def _is_stuck(self) -> bool:
         """Whether it was never feasible, and the least violation hardly falls any more."""
@@ -245,7 +226,7 @@ class _Descent:
             elif reduction < POOR * predicted:
                 self._radius *= 0.5
             self._settled = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
-            self.ended = (self._settled or self.landing) and violation < settings.violation_tolerance
+            self.ended = (self._settled or self._creeps or self.landing) and violation < settings.violation_tolerance
             self.x, self.cost, self._g, self.violation, self._length = x, cost, g, violation, size
             self._missed[:] = False
             if self.ended and not self.landing and self._looks:
@@ -258,7 +239,7 @@ class _Descent:
         tighter = self._bounds.tightened(self._g, self._motion.grid.midway)
         if tighter is None:
             return
-        self.ended, self._looks, self._bounds = False, self._looks - 1, tighter
+        self.ended, self.tightened, self._looks, self._bounds = False, True, self._looks - 1, tighter
         self._steps = steps_of(self._motion, tighter, self._settings.thin)
         self.violation = tighter.violation(self._g)
 

@@ -4,7 +4,6 @@ over the same compiled kernels.
 Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n
 joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
 
-#define NEAR_OTHERS 0.4 /* as quadratic.py has it */
 #define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
 
 typedef void kernel(long, const double *const *, const long *, double *const *);
@@ -26,6 +25,7 @@ typedef struct {
   const double *smooth;                 /* (R, R) */
   const double *lower, *upper;          /* (m, K) */
   const unsigned char *sharp;           /* (m, K) */
+  const unsigned char *accelerated;     /* (m,) */
   double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, padded n) with zeros, (width, K) */
   double *gradient, *hessian, *factor;  /* (nx,); above and below the diagonal, (nx, stride) each */
   double *scratch;
@@ -295,8 +295,8 @@ static int objective(motion *s, const double *x, double proximal) {
 }
 
 /* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, or than
-NEAR_OTHERS where no acceleration is in them and that is less, that may leap over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
-void model(motion *s, const double *x, const double *g, double proximal, double near, double step,
+`others` where no acceleration is in them and that is less, that may leap over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
+void model(motion *s, const double *x, const double *g, double proximal, double near, double others, double step,
            const unsigned char *missed, const double *multipliers, unsigned char *held) {
   long nx = s->nx, points = s->grid.points, width = s->grid.orders * s->n + s->grid.orders - 1, m = s->m;
   polyhedron *p = &s->programme;
@@ -306,7 +306,7 @@ void model(motion *s, const double *x, const double *g, double proximal, double 
   memset(J, 0, sizeof J);
   EACH(i, 0, m * points) excess[i] = outside(s, g, i);
   EACH(i, 0, m)
-    crest(s, excess + i * points, s->sharp[i * points] || near < NEAR_OTHERS ? near : NEAR_OTHERS, held + i * points);
+    crest(s, excess + i * points, s->accelerated[i] || near < others ? near : others, held + i * points);
   EACH(i, 0, m * points) held[i] |= missed[i];
   if (multipliers) EACH(i, 0, m * points) held[i] |= multipliers[i] != 0;
 
