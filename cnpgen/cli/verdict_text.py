@@ -4,6 +4,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from cnpgen.cli.describe import table
 from cnpgen.cli.plan_files import checksum_text
 from cnpgen.errors import counted
@@ -30,8 +32,12 @@ _TALLIES = {
 
 def summary_text(file: Path, found: "Evaluation") -> str:
     """Lay out what is said of all plans together."""
+    from cnpgen.judges.plans.sampling import MOST
+
     summary, count = found.summary(), len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
+    if np.nanmax(found.plans.duration, initial=0.0) > MOST * found.step:
+        step += f" or of {MOST:,} in all"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, judged at steps of {step} and between them"
     tallies = [
         (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
