@@ -21,14 +21,24 @@ if TYPE_CHECKING:
 
 
 def line_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
-    """Build ``(ends, rate, tops) -> change`` of the interior control points on the line, at a constant rate [1/s]."""
+    """Build ``(ends, offsets, rate, tops) -> change`` of the interior control points on the line.
+
+    The change is the offsets [rad], zero for a line that is straight before it is bent, and what bends the line with
+    these; the rate [1/s] is constant.
+    """
     import casadi as ca
 
-    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
-    (tops_sx, tops), rate = symbols("tops", count_numbers(problem.obstacle)), ca.SX.sym("rate")
-    points = _points(_split(ends, robot.n), [rate] * problem.trajectory.rate_control_points, problem.trajectory)
+    spec, n = problem.trajectory, robot.n
+    (ends_sx, ends), (tops_sx, tops) = (
+        symbols("ends", (3 + fixed_at_goal) * n),
+        symbols("tops", count_numbers(problem.obstacle)),
+    )
+    offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - fixed_at_goal) * n)
+    rate, aside = ca.SX.sym("rate"), _split(offsets, n)
+    points, interior = _points(_split(ends, n), [rate] * spec.rate_control_points, spec), slice(3, -fixed_at_goal)
+    points[interior] = _sums(points[interior], aside)
     change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
-    return ca.Function("line_bend", [ends_sx, rate, tops_sx], [ca.cse(_column(change))])
+    return ca.Function("line_bend", [ends_sx, offsets_sx, rate, tops_sx], [ca.cse(_column(_sums(aside, change)))])
 
 
 def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:

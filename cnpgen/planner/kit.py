@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.curves import landed_path
+from cnpgen.planner.detours import Detours, make_detours
 from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.pacing import Pacing, make_pacing
 from cnpgen.planner.preparation import Preparation, ends_of, lanes, prepare_tasks, rows
 from cnpgen.planner.slowing import Slowing, make_slowing
+from cnpgen.planner.speeds import BLOCK
+from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
@@ -73,12 +76,14 @@ class Kit:
         path: Kernel of ``curves.landed_path``.
         slowing: What slows motions from rest to rest down; None where it must not.
         pacing: What fits rates to the limits; None where it is not wanted.
+        detours: What finds other lines where plans break something; None where the model has none.
     """
 
     prepare: Preparation
     path: Kernel
     slowing: Slowing | None
     pacing: Pacing | None = None
+    detours: Detours | None = None
 
     def plan(
         self,
@@ -97,14 +102,10 @@ class Kit:
             columns: What else is known of the tasks, as ``Plans.columns``.
         """
         tasks = self.prepare(boundary)
-        given, tops = model.outputs(tasks), self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
-        (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
-        motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
-        if self.pacing is not None:
-            motion = self.pacing.paced(motion, tops)
-        if self.slowing is not None:
-            factor = self.slowing.factor(motion, tops)
-            motion = motion if factor.max(initial=1.0) <= 1 else motion.slower(factor)
+        tops = self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+        motion = self.motion(model, tasks, tops)
+        if self.detours is not None:
+            motion = self._detoured(self.detours, model, boundary, motion, tops)
         return Plans(
             problem=model.problem,
             boundary=boundary,
@@ -115,6 +116,38 @@ class Kit:
             sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
             status=np.full(len(boundary), PlanStatus.UNKNOWN, np.uint8),
         )
+
+    def motion(self, model: Model, tasks: Tasks, tops: Array) -> Motion:
+        """Ask the network; bend what it gives onto the equalities, and fit it to limits of speeds.
+
+        Args:
+            model: A model of the kit's problem.
+            tasks: N tasks, as ``prepare`` gives them.
+            tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
+        """
+        given, boundary = model.outputs(tasks), tasks.boundary
+        (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
+        motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
+        if self.pacing is not None:
+            motion = self.pacing.paced(motion, tops)
+        if self.slowing is not None:
+            factor = self.slowing.factor(motion, tops)
+            motion = motion if factor.max(initial=1.0) <= 1 else motion.slower(factor)
+        return motion
+
+    def _detoured(self, detours: Detours, model: Model, boundary: Boundary, motion: Motion, tops: Array) -> Motion:
+        """Put motions along other lines in the place of those that break something, where they break less."""
+        path, rate, count = motion.path.copy(), motion.rate.copy(), len(detours.middles)
+        before = detours.broken(motion, tops)
+        broken = np.flatnonzero(before > 1)
+        for some in (broken[first : first + BLOCK] for first in range(0, len(broken), BLOCK)):
+            each = np.repeat(some, count)
+            tasks = self.prepare(boundary[each], np.tile(detours.middles, (len(some), 1)))
+            others = self.motion(model, tasks, tops[each])
+            chosen, after = detours.best(others, tops[each])
+            less = after < before[some]
+            path[some[less]], rate[some[less]] = others.path[chosen[less]], others.rate[chosen[less]]
+        return replace(motion, path=path, rate=rate)
 
 
 def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at_goal: int = 2) -> Kit:
@@ -145,4 +178,5 @@ def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at
         )
         slowing = make_slowing(problem, robot, kernels) if slow_down else None
         pacing = make_pacing(problem, robot, kernels) if meaning.paced else None
-    return Kit(prepare, path, slowing, pacing)
+        detours = make_detours(problem, kernels, np.array(meaning.middles)) if meaning.middles else None
+    return Kit(prepare, path, slowing, pacing, detours)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.kinematics import tip_position
+from cnpgen.planner.control_points import along_line
 from cnpgen.planner.curves import line_bend
 from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
@@ -59,17 +60,30 @@ class Preparation:
     line: Kernel | None
     expected_time: str = "distance"
 
-    def __call__(self, boundary: Boundary) -> Tasks:
-        """Prepare N tasks, in float64."""
+    def __call__(self, boundary: Boundary, middle: Array | None = None) -> Tasks:
+        """Prepare N tasks, in float64.
+
+        Args:
+            boundary: Boundary conditions, shape (N, n) each.
+            middle: Where lines have a corner half way before they are bent [rad], shape (N, n); none by default.
+        """
         ends = np.concatenate([boundary.start_q, boundary.goal_q])
         (tips,) = self.tip(np.ascontiguousarray(ends.T))
         start_xyz, goal_xyz = tips[:, : len(boundary)].T, tips[:, len(boundary) :].T
         time = self._time(boundary)
-        correction = None
+        correction = None if middle is None else self._aside(boundary, middle)
         if self.line is not None:
-            (change,) = self.line(ends_of(boundary), 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
+            tops, width = lanes(self.tops(start_xyz, goal_xyz)), self.line.tape.inputs[1]
+            offsets = np.zeros((width, len(boundary))) if correction is None else lanes(correction)
+            (change,) = self.line(ends_of(boundary), offsets, 1 / time[None], tops)
             correction = rows(change, boundary.start_q.shape[1])
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
+
+    def _aside(self, boundary: Boundary, middle: Array) -> Array:
+        """How far lines with a corner are off straight ones at their interior control points [rad], shape (N, m, n)."""
+        along = along_line(self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal)
+        aside = middle - (boundary.start_q + boundary.goal_q) / 2
+        return np.asarray((1 - np.abs(2 * along - 1)) * aside[:, None])
 
     def _time(self, boundary: Boundary) -> Array:
         if self.expected_time == "distance":
