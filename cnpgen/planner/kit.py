@@ -101,11 +101,7 @@ class Kit:
             sample_id: Which samples these are, shape (N,); 0, 1, ... by default.
             columns: What else is known of the tasks, as ``Plans.columns``.
         """
-        tasks = self.prepare(boundary)
-        tops = self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
-        motion = self.motion(model, tasks, tops)
-        if self.detours is not None:
-            motion = self._detoured(self.detours, model, boundary, motion, tops)
+        tasks, motion = self.planned(model, boundary)
         return Plans(
             problem=model.problem,
             boundary=boundary,
@@ -116,6 +112,13 @@ class Kit:
             sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
             status=np.full(len(boundary), PlanStatus.UNKNOWN, np.uint8),
         )
+
+    def planned(self, model: Model, boundary: Boundary) -> tuple[Tasks, Motion]:
+        """Plan N motions; return the tasks, along the lines that were taken, too."""
+        tasks = self.prepare(boundary)
+        tops = self.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
+        motion = self.motion(model, tasks, tops)
+        return (tasks, motion) if self.detours is None else self._detoured(self.detours, model, tasks, motion, tops)
 
     def motion(self, model: Model, tasks: Tasks, tops: Array) -> Motion:
         """Ask the network; bend what it gives onto the equalities, and fit it to limits of speeds.
@@ -135,19 +138,24 @@ class Kit:
             motion = motion if factor.max(initial=1.0) <= 1 else motion.slower(factor)
         return motion
 
-    def _detoured(self, detours: Detours, model: Model, boundary: Boundary, motion: Motion, tops: Array) -> Motion:
+    def _detoured(
+        self, detours: Detours, model: Model, tasks: Tasks, motion: Motion, tops: Array
+    ) -> tuple[Tasks, Motion]:
         """Put motions along other lines in the place of those that break something, where they break less."""
-        path, rate, count = motion.path.copy(), motion.rate.copy(), len(detours.middles)
-        before = detours.broken(motion, tops)
+        path, rate, before = motion.path.copy(), motion.rate.copy(), detours.broken(motion, tops)
+        correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
+        correction += 0.0 if tasks.correction is None else tasks.correction
         broken = np.flatnonzero(before > 1)
         for some in (broken[first : first + BLOCK] for first in range(0, len(broken), BLOCK)):
-            each = np.repeat(some, count)
-            tasks = self.prepare(boundary[each], np.tile(detours.middles, (len(some), 1)))
-            others = self.motion(model, tasks, tops[each])
+            each = np.repeat(some, len(detours.middles))
+            bent = self.prepare(tasks.boundary[each], np.tile(detours.middles, (len(some), 1)))
+            assert bent.correction is not None
+            others = self.motion(model, bent, tops[each])
             chosen, after = detours.best(others, tops[each])
             less = after < before[some]
-            path[some[less]], rate[some[less]] = others.path[chosen[less]], others.rate[chosen[less]]
-        return replace(motion, path=path, rate=rate)
+            here, there = some[less], chosen[less]
+            path[here], rate[here], correction[here] = others.path[there], others.rate[there], bent.correction[there]
+        return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
 
 
 def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at_goal: int = 2) -> Kit:

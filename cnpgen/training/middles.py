@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner.detours import Detours, make_detours
 from cnpgen.planner.kit import Kit, make_kit, surroundings
 from cnpgen.planner.model import Model
+from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
 
@@ -31,7 +33,13 @@ def with_middles(model: Model, boundary: Boundary, *, count: int = 24, seed: int
         boundary: Problems to choose by, some thousands, that it was not scored on; shape (N, n) each.
         count: How many to choose at most; fewer where no other one mends anything.
         seed: Of what is random.
+
+    Raises:
+        UsageError: ``count`` is no positive integer, or the model has such configurations already.
     """
+    count = integer("count", count, least=1)
+    if model.meaning.middles:
+        raise UsageError(f"the model has {len(model.meaning.middles)} middles already")
     random = np.random.default_rng(seed)
     with surroundings(model.problem) as given:
         kit = make_kit(given, model.meaning, slow_down=False, fixed_at_goal=model.fixed_at_goal)

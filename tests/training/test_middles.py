@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cnpgen.errors import UsageError
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import load_model
 from cnpgen.planner.planner import Planner
@@ -27,6 +28,10 @@ def test_other_lines_are_chosen_that_mend_plans_of_other_problems(monkeypatch: p
     chosen = middles.with_middles(model, rows, count=3)
     assert 1 <= len(chosen.meaning.middles) <= 3
     assert chosen.meaning == middles.with_middles(model, rows, count=3).meaning
+    with pytest.raises(UsageError, match=r"has \d middles already"):
+        middles.with_middles(chosen, rows)
+    with pytest.raises(UsageError, match="count"):
+        middles.with_middles(model, rows, count=0)
     others, kit = draw_boundary_problems("heavy-object-anywhere", 400, seed=6).boundary, Planner(chosen)._kit
     assert kit.detours is not None
     plans = [Planner(each).plan_batch(others) for each in (model, chosen)]
