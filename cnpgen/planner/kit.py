@@ -177,6 +177,7 @@ def make_kit(given: Surroundings, meaning: Meaning, *, slow_down: bool, fixed_at
             expected_time=meaning.expected_time,
             fixed_at_goal=fixed_at_goal,
             within_limits=meaning.within_limits,
+            corners=bool(meaning.middles),
         )
         path = kernels.load(
             landed_path,

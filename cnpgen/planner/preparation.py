@@ -12,7 +12,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.planner.control_points import along_line
-from cnpgen.planner.curves import line_bend
+from cnpgen.planner.curves import corner_bend, line_bend
 from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
@@ -51,6 +51,7 @@ class Preparation:
         tip: Kernel of ``symbolic.kinematics.tip_position``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
+        corner: Kernel of ``curves.corner_bend``; None where there are no lines with corners, or they are not bent.
     """
 
     problem: Problem
@@ -59,6 +60,7 @@ class Preparation:
     tip: Kernel
     line: Kernel | None
     expected_time: str = "distance"
+    corner: Kernel | None = None
 
     def __call__(self, boundary: Boundary, middle: Array | None = None) -> Tasks:
         """Prepare N tasks, in float64.
@@ -72,10 +74,9 @@ class Preparation:
         start_xyz, goal_xyz = tips[:, : len(boundary)].T, tips[:, len(boundary) :].T
         time = self._time(boundary)
         correction = None if middle is None else self._aside(boundary, middle)
-        if self.line is not None:
-            tops, width = lanes(self.tops(start_xyz, goal_xyz)), self.line.tape.inputs[1]
-            offsets = np.zeros((width, len(boundary))) if correction is None else lanes(correction)
-            (change,) = self.line(ends_of(boundary), offsets, 1 / time[None], tops)
+        bend, aside = (self.line, []) if correction is None else (self.corner, [lanes(correction)])
+        if bend is not None:
+            (change,) = bend(ends_of(boundary), *aside, 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
             correction = rows(change, boundary.start_q.shape[1])
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
 
@@ -104,6 +105,7 @@ def prepare_tasks(
     expected_time: str = "distance",
     fixed_at_goal: int = 2,
     within_limits: bool = False,
+    corners: bool = False,
 ) -> Preparation:
     """Load what tasks are prepared with.
 
@@ -115,9 +117,11 @@ def prepare_tasks(
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
         within_limits: Whether control points are kept within the joint limits (``Meaning``).
+        corners: Whether there are lines with corners, too.
     """
     steps = useful_steps(kernels, bending_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     line = load(line_bend) if steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
-    return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time)
+    corner = load(corner_bend) if steps and corners else None
+    return Preparation(problem, *limits, kernels.load(tip_position), line, expected_time, corner)

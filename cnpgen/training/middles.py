@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
-from cnpgen.planner.detours import Detours, make_detours
 from cnpgen.planner.kit import Kit, make_kit, surroundings
 from cnpgen.planner.model import Model
 from cnpgen.schema.arguments import integer
@@ -42,27 +41,28 @@ def with_middles(model: Model, boundary: Boundary, *, count: int = 24, seed: int
         raise UsageError(f"the model has {len(model.meaning.middles)} middles already")
     random = np.random.default_rng(seed)
     with surroundings(model.problem) as given:
-        kit = make_kit(given, model.meaning, slow_down=False, fixed_at_goal=model.fixed_at_goal)
-        detours = make_detours(given.problem, given.kernels, np.empty((0, given.robot.n)))
+        cornered = replace(model.meaning, middles=(tuple(given.robot.base.tolist()),))  # any: these are not asked for
+        kit = make_kit(given, cornered, slow_down=False, fixed_at_goal=model.fixed_at_goal)
         lower, upper = given.robot.position_lower, given.robot.position_upper
-    motion, whole = _planned(model, kit, detours, boundary)
+    motion, whole = _planned(model, kit, boundary)
     passed = motion[np.flatnonzero(whole)].at(ALONG).q.reshape(-1, len(lower))
     passed = passed[random.permutation(len(passed))[: TRIED // 2]]
     tried = np.concatenate([random.uniform(lower, upper, (TRIED - len(passed), len(lower))), passed])
     broken = boundary[np.flatnonzero(~whole)[:MENDED]]
-    mended = [_planned(model, kit, detours, broken, np.tile(each, (len(broken), 1)))[1] for each in tried]
+    mended = [_planned(model, kit, broken, np.tile(each, (len(broken), 1)))[1] for each in tried]
     chosen = tried[_most_useful(np.array(mended), count)]
     return replace(model, meaning=replace(model.meaning, middles=tuple(map(tuple, chosen.tolist()))))
 
 
 def _planned(
-    model: Model, kit: Kit, detours: Detours, boundary: Boundary, middle: Array | None = None
+    model: Model, kit: Kit, boundary: Boundary, middle: Array | None = None
 ) -> tuple[Motion, NDArray[np.bool_]]:
     """Plan, along lines with corners if ``middle`` says where; say which plans break nothing."""
     tasks = kit.prepare(boundary, middle)
     tops = kit.prepare.tops(tasks.start_xyz, tasks.goal_xyz)
     motion = kit.motion(model, tasks, tops)
-    return motion, detours.broken(motion, tops) <= 1
+    assert kit.detours is not None
+    return motion, kit.detours.broken(motion, tops) <= 1
 
 
 def _most_useful(mended: NDArray[np.bool_], count: int) -> list[int]:
