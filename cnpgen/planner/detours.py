@@ -20,7 +20,7 @@ PHASES = 64
 
 @dataclass(frozen=True)
 class Detours:
-    """Says which plans need another line, and which of the others is best; made by ``make_detours``.
+    """Says which plans need another line, and which of the others will do; made by ``make_detours``.
 
     Attributes:
         middles: Where the corners of other lines are [rad], shape (M, n).
@@ -40,29 +40,27 @@ class Detours:
             tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
 
         Returns:
-            Shape (N,); at most 1 where nothing is broken at any of the phases.
+            Shape (N,); at most 1 where nothing is broken at any of the phases, inf where positions are no numbers.
         """
         found, phases = np.empty(len(motion)), len(self.path)
         for block in (slice(first, first + BLOCK) for first in range(0, len(motion), BLOCK)):
             q = (self.path @ motion.path[block]).reshape(-1, motion.path.shape[2])
             (worst,) = self.excess(np.ascontiguousarray(q.T), np.repeat(tops[block].T, phases, axis=1))
             found[block] = worst.reshape(-1, phases).max(axis=1)
-        return found
+        return np.nan_to_num(found, nan=np.inf, posinf=np.inf)
 
-    def best(self, motion: Motion, tops: Array) -> tuple[NDArray[np.intp], Array]:
-        """Choose among the motions along all lines of N tasks: one that breaks least, the fastest of equals.
+    def worth(self, broken: Array) -> NDArray[np.intp]:
+        """Say which motions may be taken of those along all M lines of the first task, then of the next one.
 
         Args:
-            motion: Motions along all M lines of the first task, then of the next one.
-            tops: Where the obstacles are, of every motion.
+            broken: What they break, shape (N M,).
 
         Returns:
-            Which motions, shape (N,), and what these break.
+            Rows of motions: of every task those that break nothing, or else the one that breaks least.
         """
-        broken, count = self.broken(motion, tops), len(self.middles)
-        ranks = motion.duration().reshape(-1, count), np.maximum(broken, 1).reshape(-1, count)
-        chosen = np.lexsort(ranks, axis=-1)[:, 0] + count * np.arange(len(broken) // count)
-        return chosen, broken[chosen]
+        of_task = broken.reshape(-1, len(self.middles))
+        least = of_task.min(axis=1, keepdims=True)
+        return np.flatnonzero(of_task <= np.maximum(least, 1))
 
 
 def make_detours(problem: Problem, kernels: KernelLibrary, middles: Array) -> Detours:

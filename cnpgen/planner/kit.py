@@ -128,9 +128,14 @@ class Kit:
             tasks: N tasks, as ``prepare`` gives them.
             tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
         """
+        return self._fitted(self._landed(model, tasks, tops), tops)
+
+    def _landed(self, model: Model, tasks: Tasks, tops: Array) -> Motion:
         given, boundary = model.outputs(tasks), tasks.boundary
         (path,) = self.path(ends_of(boundary), lanes(given.offsets), lanes(given.rate), lanes(tops))
-        motion = Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
+        return Motion(rows(path, boundary.start_q.shape[1]), given.rate, model.problem.trajectory.degree)
+
+    def _fitted(self, motion: Motion, tops: Array) -> Motion:
         if self.pacing is not None:
             motion = self.pacing.paced(motion, tops)
         if self.slowing is not None:
@@ -150,11 +155,19 @@ class Kit:
             each = np.repeat(some, len(detours.middles))
             bent = self.prepare(tasks.boundary[each], np.tile(detours.middles, (len(some), 1)))
             assert bent.correction is not None
-            others = self.motion(model, bent, tops[each])
-            chosen, after = detours.best(others, tops[each])
-            less = after < before[some]
-            here, there = some[less], chosen[less]
-            path[here], rate[here], correction[here] = others.path[there], others.rate[there], bent.correction[there]
+            others = self._landed(model, bent, tops[each])
+            after = detours.broken(others, tops[each])
+            worth = detours.worth(after)
+            fitted, time = self._fitted(others[worth], tops[each[worth]]), np.full(len(each), np.inf)
+            time[worth] = fitted.duration()
+            chosen = time.reshape(len(some), -1).argmin(axis=1) + len(detours.middles) * np.arange(len(some))
+            less = after[chosen] < before[some]
+            here, there = some[less], np.searchsorted(worth, chosen[less])
+            path[here], rate[here], correction[here] = (
+                fitted.path[there],
+                fitted.rate[there],
+                bent.correction[chosen[less]],
+            )
         return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
 
 

@@ -14,7 +14,6 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import Motion
 from cnpgen.world.state import World
 from tests.conftest import needs_compiler
 from tests.examples.models import quickest
@@ -54,15 +53,10 @@ def test_what_is_broken_at_rest_is_what_pinocchio_and_coal_say() -> None:
     assert (found[0, 6:] <= 1).all()
 
 
-def test_of_lines_that_break_nothing_the_fastest_is_taken_and_of_others_the_one_that_breaks_least() -> None:
-    class Given(Detours):
-        def broken(self, motion: Motion, tops: np.ndarray) -> np.ndarray:
-            return np.array([0.5, 2.0, 0.9, 7.0, 3.0, 5.0])
-
-    motion = Motion(np.zeros((6, 15, 7)), np.ones((6, 20)) / np.array([3.0, 1.0, 2.0, 1.0, 4.0, 1.0])[:, None])
-    chosen, broken = Given(np.zeros((3, 7)), None, None).best(motion, np.zeros((6, 2)))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(chosen, [2, 4])
-    np.testing.assert_array_equal(broken, [0.9, 3.0])
+def test_of_lines_those_that_break_nothing_may_be_taken_or_else_the_one_that_breaks_least() -> None:
+    detours = Detours(np.zeros((3, 7)), None, None)  # type: ignore[arg-type]
+    broken = np.array([0.5, 2.0, 0.9, 7.0, 3.0, 5.0, np.inf, np.inf, 4.0])
+    np.testing.assert_array_equal(detours.worth(broken), [0, 2, 4, 8])
 
 
 @needs_compiler
