@@ -163,11 +163,8 @@ class Kit:
             chosen = time.reshape(len(some), -1).argmin(axis=1) + len(detours.middles) * np.arange(len(some))
             less = after[chosen] < before[some]
             here, there = some[less], np.searchsorted(worth, chosen[less])
-            path[here], rate[here], correction[here] = (
-                fitted.path[there],
-                fitted.rate[there],
-                bent.correction[chosen[less]],
-            )
+            path[here], rate[here] = fitted.path[there], fitted.rate[there]
+            correction[here] = bent.correction[chosen[less]]
         return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
 
 
