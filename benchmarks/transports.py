@@ -6,8 +6,8 @@
 * "on joint limits": likewise, with a joint of the start or of the goal on its limit;
 * "another problem's": the goal of the next row of the dataset heavy-object, where both ends are free of collision.
 
-No joint is farther from start to goal than 165 degrees: beyond, some tasks have no solution. Nothing was chosen by
-these seeds. The clock is CPU time, one BLAS thread. Goals stand beside the figures.
+No joint is farther from start to goal than 165 degrees, as in the dataset. Nothing was chosen by these seeds. The clock
+is CPU time, one BLAS thread. Goals stand beside the figures.
 
 With ``--again N``, N problems of each set are refined from the planner's plan and solved from nothing, and both results
 refined once more, to see what the first one left: how many are valid later only, how many become shorter by more than

@@ -112,6 +112,7 @@ from cnpgen.store.inspection import inspect_dataset as inspect_dataset
 from cnpgen.store.record import ShardRecord as ShardRecord
 from cnpgen.store.statistics import FieldStatistics as FieldStatistics
 from cnpgen.store.summary import Summary as Summary
+from cnpgen.training.middles import with_middles as with_middles
 from cnpgen.training.settings import TrainingSettings as TrainingSettings
 from cnpgen.training.train import Trained as Trained
 from cnpgen.training.train import train_model as train_model

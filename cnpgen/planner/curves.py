@@ -35,11 +35,33 @@ def line_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: in
     """Build ``(ends, rate, tops) -> change`` of the interior control points on the line, at a constant rate [1/s]."""
     import casadi as ca
 
-    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
-    (tops_sx, tops), rate = symbols("tops", count_numbers(problem.obstacle)), ca.SX.sym("rate")
-    points = _points(_split(ends, robot.n), [rate] * problem.trajectory.rate_control_points, problem.trajectory)
+    ends_sx, rate, points = _line(robot, problem, fixed_at_goal)
+    tops_sx, tops = symbols("tops", count_numbers(problem.obstacle))
     change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     return ca.Function("line_bend", [ends_sx, rate, tops_sx], [ca.cse(_column(change))])
+
+
+def corner_bend(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+    """Build ``(ends, offsets, rate, tops) -> change``: the same of a line with offsets [rad], these included."""
+    import casadi as ca
+
+    ends_sx, rate, points = _line(robot, problem, fixed_at_goal)
+    tops_sx, tops = symbols("tops", count_numbers(problem.obstacle))
+    interior = slice(3, -fixed_at_goal)
+    offsets_sx, offsets = symbols("offsets", len(points[interior]) * robot.n)
+    aside = _split(offsets, robot.n)
+    points[interior] = _sums(points[interior], aside)
+    change = bend(robot, problem, points, tops, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    return ca.Function("corner_bend", [ends_sx, offsets_sx, rate, tops_sx], [ca.cse(_column(_sums(aside, change)))])
+
+
+def _line(robot: "Robot", problem: Problem, fixed_at_goal: int) -> tuple[Any, Any, list[Vec]]:
+    """Return symbols of boundary conditions and of a constant rate, and the control points of the line between them."""
+    import casadi as ca
+
+    (ends_sx, ends), rate = symbols("ends", (3 + fixed_at_goal) * robot.n), ca.SX.sym("rate")
+    spec = problem.trajectory
+    return ends_sx, rate, _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
 
 
 def landed_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:

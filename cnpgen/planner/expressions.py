@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
+FINEST = 1e-9  # a tolerance of zero is taken for this
 
 
 def equality_residuals(robot: "Robot", problem: Problem) -> Any:
@@ -78,6 +79,24 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
                 out += [value - float(high)] if np.isfinite(high) else []
     worst = reduce(ca.fmax, out) if out else ca.SX(-1)
     return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
+
+
+def rest_excess(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, tops) -> e``: by how much the worst condition is broken by the robot at rest, in tolerances."""
+    import casadi as ca
+
+    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
+    rest = [0.0] * robot.n
+    jerk = rest if problem.uses_jerk else None
+    state = SymbolicState(robot, q, rest, rest, tops, problem.obstacle, problem.object_size, jerk)
+    out: list[Any] = []
+    for constraint in problem.constraint:
+        for condition in constraint.symbolic(state):
+            allowed = np.maximum(constraint.allowed(condition), FINEST)
+            for value, low, high, unit in zip(condition.g, condition.lower, condition.upper, allowed, strict=True):
+                out += [(float(low) - value) / float(unit)] if np.isfinite(low) else []
+                out += [(value - float(high)) / float(unit)] if np.isfinite(high) else []
+    return ca.Function("rest_excess", [q_sx, tops_sx], [reduce(ca.fmax, out, ca.SX(-1))])
 
 
 def useful_steps(kernels: KernelLibrary, steps: int) -> int:

@@ -29,6 +29,8 @@ class Meaning:
             limits, as in the paper, or the least time in which joints could "reach" their goal states.
         within_limits: Whether control points are put back within the joint limits after every one of these steps.
         paced: Whether rates are then made as large, or as small, as limits allow or ask for (``pacing``).
+        middles: Where the corners are of the other lines that are tried where a plan breaks something [rad], n numbers
+            each (``detours``).
     """
 
     path_scale: float
@@ -37,6 +39,7 @@ class Meaning:
     expected_time: str = "distance"
     within_limits: bool = False
     paced: bool = False
+    middles: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)

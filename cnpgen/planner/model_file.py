@@ -28,7 +28,12 @@ from cnpgen.store.paths import require_file
 
 KIND, VERSION = "cnpgen-model", 1
 MOST_STEPS = 20  # of Gauss-Newton, each of which makes a kernel larger
-_UNSAID = {"expected_time": "distance", "within_limits": False, "paced": False}  # what files need not say
+_UNSAID = {
+    "expected_time": "distance",
+    "within_limits": False,
+    "paced": False,
+    "middles": (),
+}  # what files need not say
 _FORM = {
     "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
     "features": [TEXT],
@@ -158,8 +163,12 @@ def _assembled(content: Content) -> Model:
     problem = ProblemRecord(content.texts["problem_recipe"], content.texts["problem_urdf"])
     architecture = Architecture(**description["architecture"])
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
-    meaning = Meaning(**description["meaning"])
+    said = description["meaning"]
+    meaning = Meaning(**{**said, "middles": tuple(tuple(map(float, each)) for each in said.get("middles", ()))})
     _check_sizes(problem, architecture, features)
+    joints = len(problem.joint_names)
+    if not all(len(each) == joints and np.isfinite(each).all() for each in meaning.middles):
+        raise ValueError(f"middles must be {joints} numbers each, got {meaning.middles}")
     if unknown := set(description["rest"]) - set(CONDITIONS):
         raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
     if positions := {"start_q", "goal_q"} & set(description["rest"]):

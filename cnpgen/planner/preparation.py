@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.curves import line_bend, tips_at_ends
+from cnpgen.planner.control_points import along_line
+from cnpgen.planner.curves import corner_bend, line_bend, tips_at_ends
 from cnpgen.planner.expressions import useful_steps
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import obstacle_tops
@@ -49,6 +50,7 @@ class Preparation:
         tips: Kernel of ``curves.tips_at_ends``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
+        corner: Kernel of ``curves.corner_bend``; None where there are no lines with corners, or they are not bent.
     """
 
     problem: Problem
@@ -57,22 +59,31 @@ class Preparation:
     tips: Kernel
     line: Kernel | None
     expected_time: str = "distance"
+    corner: Kernel | None = None
 
-    def __call__(self, boundary: Boundary, *, ends: Array | None = None) -> Tasks:
+    def __call__(self, boundary: Boundary, middle: Array | None = None, *, ends: Array | None = None) -> Tasks:
         """Prepare N tasks, in float64.
 
         Args:
             boundary: Boundary conditions, shape (N, n) each.
-            ends: What ``ends_of`` gives of them, where that is known.
+            middle: Where lines have a corner half way before they are bent [rad], shape (N, n); none by default.
+            ends: What ``ends_of`` gives of the boundary conditions, where that is known.
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz = (tip.T for tip in self.tips(ends))
         time = self._time(boundary)
-        correction = None
-        if self.line is not None:
-            (change,) = self.line(ends, 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
+        correction = None if middle is None else self._aside(boundary, middle)
+        bend, aside = (self.line, []) if correction is None else (self.corner, [lanes(correction)])
+        if bend is not None:
+            (change,) = bend(ends, *aside, 1 / time[None], lanes(self.tops(start_xyz, goal_xyz)))
             correction = rows(change, boundary.start_q.shape[1])
         return Tasks(boundary, start_xyz, goal_xyz, time, correction)
+
+    def _aside(self, boundary: Boundary, middle: Array) -> Array:
+        """How far lines with a corner are off straight ones at their interior control points [rad], shape (N, m, n)."""
+        along = along_line(self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal)
+        aside = middle - (boundary.start_q + boundary.goal_q) / 2
+        return np.asarray((1 - np.abs(2 * along - 1)) * aside[:, None])
 
     def _time(self, boundary: Boundary) -> Array:
         if self.expected_time == "distance":
@@ -93,6 +104,7 @@ def prepare_tasks(
     expected_time: str = "distance",
     fixed_at_goal: int = 2,
     within_limits: bool = False,
+    corners: bool = False,
 ) -> Preparation:
     """Load what tasks are prepared with.
 
@@ -104,10 +116,12 @@ def prepare_tasks(
         expected_time: Which of ``EXPECTED_TIMES`` is taken.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
         within_limits: Whether control points are kept within the joint limits (``Meaning``).
+        corners: Whether there are lines with corners, too.
     """
     steps = useful_steps(kernels, bending_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     line = load(line_bend) if steps else None
     limits = robot.velocity_limit, robot.acceleration_limit
     tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
-    return Preparation(problem, *limits, tips, line, expected_time)
+    corner = load(corner_bend) if steps and corners else None
+    return Preparation(problem, *limits, tips, line, expected_time, corner)

@@ -40,6 +40,23 @@ class Excess:
     slower: float
 
 
+@dataclass(frozen=True)
+class AtRest:
+    """What the residuals of a robot at rest must be on the way of one task, shape (m,) each.
+
+    Attributes:
+        lower: Their lower bounds.
+        upper: Their upper bounds.
+        capsules: Which are clearances of capsules.
+        equal: Which are equalities that positions alone meet.
+    """
+
+    lower: Array
+    upper: Array
+    capsules: NDArray[np.bool_]
+    equal: NDArray[np.bool_]
+
+
 class FineCheck:
     """The fine check of motions of one problem.
 
@@ -87,11 +104,12 @@ class FineCheck:
         slower = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
         return cost, Excess(worst, bool(high[:, self._bounds.needs == 0].any()), slower)
 
-    def bounds_at_rest(self, task: Task) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Return which residuals are clearances of capsules, and bounds half way with tolerances, shape (m,) each."""
-        bounds, middle = self._bounds.of(task.start_xyz), POINTS // 2
-        allowed = np.where(self._bounds.capsules, 0.0, self._bounds.allowed)
-        return self._bounds.capsules, bounds.lower[middle] - allowed, bounds.upper[middle] + allowed
+    def bounds_at_rest(self, task: Task) -> AtRest:
+        """Return the bounds half way, with tolerances but for those of clearances of capsules."""
+        bounds, middle, capsules = self._bounds.of(task.start_xyz), POINTS // 2, self._bounds.capsules
+        allowed = np.where(capsules, 0.0, self._bounds.allowed)
+        equal = self._equal & (self._bounds.needs == 0)
+        return AtRest(bounds.lower[middle] - allowed, bounds.upper[middle] + allowed, capsules, equal)
 
     def too_fast(self, task: Task, x: Array) -> float:
         """Return by which factor a motion is too fast for bounds of speeds other than those of joints; 1 if it is not.

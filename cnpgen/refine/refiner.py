@@ -12,7 +12,7 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.fine import FineCheck
 from cnpgen.refine.passes import FAR, Pass, Passes, default_passes
-from cnpgen.refine.seeds import Space, along_way, find_way
+from cnpgen.refine.seeds import Space, along_way, find_ways
 from cnpgen.refine.solver import starts
 from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
 from cnpgen.refine.solver.compiled import load_steps
@@ -35,7 +35,6 @@ LOWEST_RATE = 1e-3  # of a plan's largest rate control point
 LOST = 10.0  # boundary states further outside, in scaled units, are no problem for steps; DAQP may take hours over them
 TOUCHING = 0.02  # m: as deep as links may be in a plan that is gone on from
 CERTAIN = 1e-5  # m: what is deeper at an end is not a matter of rounding
-SEEDS = 3  # ways round obstacles that are tried
 ROOM = 1.6  # times slower than bounds of speeds ask for: a start that is within them moves on more easily
 ROUNDS = 4  # from a motion that was slowed down; most need one
 
@@ -131,6 +130,8 @@ class Refiner:
         best = yield from self._restarted(task, best.x, even, best)
         if task.deadline is None and keeps_clear(self.problem, self.robot):
             yield from self._around(task, best)
+        elif task.deadline is None and task.at_rest:
+            yield from (self._along(task, start) for start in self._ways(task))
 
     def _restarted(
         self, task: Task, given: Array | None, line: Array, best: Attempt
@@ -218,7 +219,7 @@ class Refiner:
         if touching:
             yield from self._on_hulls(task, best, hulls)
         for start in self._ways(task, hulls):
-            first = self._attempt(task, self.passes.given, start.x, Outcome.RESTARTED)
+            first = self._along(task, start)
             yield first
             yield from self._on_hulls(task, first if first.excess <= 1 else start, hulls)
         if not touching:
@@ -231,19 +232,21 @@ class Refiner:
         if first.excess <= 1:
             yield self._attempt(task, self.passes.strict, first.x, Outcome.RESTARTED, hulls)
 
-    def _ways(self, task: Task, hulls: Hulls) -> Iterator[Attempt]:
-        """Yield motions along ways round the obstacles, slow enough where they may be."""
-        if self.check.equalities:  # hardly any configuration meets them
-            return
-        space, ends = Space(self.stage, hulls, *self.check.bounds_at_rest(task), task.tops), task.boundary
-        for seed in range(SEEDS):
-            way = find_way(ends.start_q[0], ends.goal_q[0], self.robot, space.free, seed=seed)
-            if way is None:
-                return
-            x = self._slow_enough(task, along_way(way, ends, self.robot.velocity_limit, self.spec))
+    def _ways(self, task: Task, hulls: Hulls | None = None) -> Iterator[Attempt]:
+        """Yield motions along ways that are free, slow enough where they may be."""
+        ends, robot = task.boundary, self.robot
+        space = Space(self.stage, robot, self.check.bounds_at_rest(task), task.tops, hulls)
+        for way in find_ways(ends.start_q[0], ends.goal_q[0], robot, space.follow):
+            x = self._slow_enough(task, along_way(way, ends, robot.velocity_limit, self.spec))
             yield self._measured(task, x, Outcome.RESTARTED, at_any_cost=True)
-            if len(way) == 2:  # a line, which other random numbers would not change
-                return
+
+    def _along(self, task: Task, start: Attempt) -> Attempt:
+        """Go on from a motion along a way: first so that no step leaves what is free by much, then as usual."""
+        best = self._attempt(task, self.passes.way, start.x, Outcome.RESTARTED)
+        if best.excess <= 1:
+            then = self._attempt(task, self.passes.given, best.x, Outcome.RESTARTED)
+            best = self._iterated_on(task, then if then.is_better(best) else best)
+        return replace(best, outcome=Outcome.RESTARTED)
 
     def minimise(self, task: Task, which: Pass, x: Array, hulls: Hulls | None = None) -> Result:
         """Run one pass from variables x, shape (nx,); with hulls these are kept clear in the place of capsules."""

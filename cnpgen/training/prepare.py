@@ -16,6 +16,7 @@ from cnpgen.planner.kit import Kit, Surroundings, make_kit
 from cnpgen.planner.landing import make_landing
 from cnpgen.planner.model import Meaning, Model, begins_and_ends_at_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
+from cnpgen.planner.network.features import Features, count_features, usual_blocks
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
 from cnpgen.training.rows import Rows, prepare_rows, resting
@@ -57,15 +58,16 @@ def prepare_run(
     boundary = source.training()
     rest, spec = resting(boundary), given.problem.trajectory
     fixed = boundary.fixed_at_goal
-    kit = make_kit(given, settings.meaning, slow_down=begins_and_ends_at_rest(rest, fixed), fixed_at_goal=fixed)
-    rows, features = prepare_rows(boundary, kit.prepare, features=None if first is None else first.features)
+    meaning = settings.meaning if first is None else replace(settings.meaning, middles=first.meaning.middles)
+    kit = make_kit(given, meaning, slow_down=begins_and_ends_at_rest(rest, fixed), fixed_at_goal=fixed)
+    architecture = _architecture(given, settings, boundary, first)
+    if first is not None:
+        _check_first(first, architecture, settings, given, rest)
+    rows, features = _rows(boundary, kit, first)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, given)
     loss = _loss(given, settings)
     held_out = source.checked(check_rows)
-    architecture = _architecture(given, settings, boundary, inputs=rows.features.shape[1])
-    if first is not None:
-        _check_first(first, architecture, settings, given, rest)
     landing = make_landing(
         given.problem,
         given.kernels,
@@ -81,12 +83,21 @@ def prepare_run(
         features=features,
         metric=_metric(loss, settings),
         problem=given.record,
+        meaning=meaning,
         validate=lambda model: validate(model, kit, held_out),
         rest=rest,
         first=None if first is None else first.parameters,
         training={"command": command, **identity(source, settings), "stages": source.dataset.blueprint.stages},
     )
     return run, kit
+
+
+def _rows(boundary: Boundary, kit: Kit, first: Model | None) -> tuple[Rows, Features]:
+    """Prepare the rows, along the lines that plans of the first model take."""
+    if first is None:
+        return prepare_rows(boundary, kit.prepare)
+    lines = None if kit.detours is None else lambda some: kit.planned(first, some)[0]
+    return prepare_rows(boundary, kit.prepare, features=first.features, lines=lines)
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
@@ -126,10 +137,12 @@ def _said(architecture: Architecture, meaning: Meaning, rest: tuple[str, ...]) -
     return {**asdict(architecture), **about}
 
 
-def _architecture(given: Surroundings, settings: TrainingSettings, boundary: Boundary, *, inputs: int) -> Architecture:
-    spec = given.problem.trajectory
+def _architecture(
+    given: Surroundings, settings: TrainingSettings, boundary: Boundary, first: Model | None
+) -> Architecture:
+    spec, blocks = given.problem.trajectory, usual_blocks(boundary) if first is None else first.features.blocks
     return Architecture(
-        inputs=inputs,
+        inputs=count_features(blocks, given.robot.n),
         hidden=settings.hidden,
         layers=settings.layers,
         path_outputs=given.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),

@@ -1,5 +1,6 @@
 """The rows that are trained on, prepared once: tasks, features and obstacles in memory."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -51,7 +52,12 @@ def boundary_columns(columns: dict[str, Array]) -> Boundary:
 
 
 def prepare_rows(
-    boundary: Boundary, prepare: Preparation, *, features: Features | None = None, dtype: str = "float32"
+    boundary: Boundary,
+    prepare: Preparation,
+    *,
+    features: Features | None = None,
+    lines: Callable[[Boundary], Tasks] | None = None,
+    dtype: str = "float32",
 ) -> tuple[Rows, Features]:
     """Prepare rows, a block at a time: what is needed on the way takes four times what is kept.
 
@@ -59,6 +65,7 @@ def prepare_rows(
         boundary: Boundary conditions of N rows.
         prepare: What prepares tasks of the problem.
         features: How features are standardised; by these rows if None.
+        lines: What prepares tasks along other lines; ``prepare`` if None.
         dtype: Float type of the rows.
 
     Returns:
@@ -69,7 +76,7 @@ def prepare_rows(
     chosen = features or fit_features((straight(boundary[block]) for block in blocks), usual_blocks(boundary))
     kept: dict[str, Array] = {}
     for block in blocks:
-        for name, values in _arrays(prepare, boundary[block], chosen, dtype).items():
+        for name, values in _arrays((lines or prepare)(boundary[block]), prepare, chosen, dtype).items():
             if name not in kept:
                 kept[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             kept[name][block] = values
@@ -78,10 +85,9 @@ def prepare_rows(
     return rows, chosen
 
 
-def _arrays(prepare: Preparation, boundary: Boundary, features: Features, dtype: str) -> dict[str, Array]:
-    """Prepare a block of rows: everything that has a row per task, by name."""
-    tasks = prepare(boundary)
-    found = boundary.given()
+def _arrays(tasks: Tasks, prepare: Preparation, features: Features, dtype: str) -> dict[str, Array]:
+    """Return everything of a block of rows that has a row per task, by name."""
+    found = tasks.boundary.given()
     found |= {name: values for name, values in vars(tasks).items() if name != "boundary" and values is not None}
     return found | {"features": features.of(tasks, dtype), "tops": prepare.tops(tasks.start_xyz, tasks.goal_xyz)}
 

@@ -12,7 +12,7 @@ from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_wait
-from cnpgen.planner.model import Model
+from cnpgen.planner.model import Meaning, Model
 from cnpgen.planner.network.features import Features
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.training.adam import learning_rate
@@ -42,6 +42,7 @@ class Run:
         features: How their features are standardised.
         metric: Weights of the constraint terms.
         problem: The problem.
+        meaning: What the network's outputs stand for.
         validate: Judges a model: a record for the log with a ``score``, the larger the better.
         rest: Boundary conditions that are zero in every training row.
         first: Parameters to start from; None for random ones.
@@ -56,6 +57,7 @@ class Run:
     features: Features
     metric: Metric
     problem: ProblemRecord
+    meaning: Meaning
     validate: Validate
     rest: tuple[str, ...] = ()
     first: Array | None = None
@@ -105,7 +107,7 @@ class Run:
             architecture=self.learner.architecture,
             parameters=parameters.astype(np.float32),
             features=self.features,
-            meaning=self.learner.settings.meaning,
+            meaning=self.meaning,
             rest=self.rest,
             training=self.training,
         )

@@ -61,6 +61,16 @@ def test_a_model_says_what_is_done_behind_its_network_unless_it_is_the_usual(mod
         load_model(tmp_path / "w.h5")
 
 
+def test_a_model_comes_back_with_the_corners_of_its_other_lines(model, tmp_path):
+    corners = tuple(map(tuple, np.random.default_rng(0).uniform(-1, 1, (2, 6)).tolist()))
+    cornered = replace(model, meaning=replace(model.meaning, middles=corners))
+    save_model(tmp_path / "c.h5", cornered)
+    assert load_model(tmp_path / "c.h5").meaning == cornered.meaning
+    save_model(tmp_path / "w.h5", replace(model, meaning=replace(model.meaning, middles=((0.1, 0.2),))))
+    with pytest.raises(DatasetError, match="middles must be 6 numbers each"):
+        load_model(tmp_path / "w.h5")
+
+
 def test_equal_models_give_equal_bytes(model, tmp_path):
     for name in ("a.h5", "b.h5"):
         save_model(tmp_path / name, model)

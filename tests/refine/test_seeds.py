@@ -1,6 +1,6 @@
 """Ways round obstacles: free as meshes tell, the same each time, and what solves where straight lines do not."""
 
-from itertools import pairwise
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from cnpgen.problems.robot import load_robot
 from cnpgen.refine import seeds
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.polish import refine_task
-from cnpgen.refine.seeds import Space, along_way, find_way, go
+from cnpgen.refine.seeds import Follow, Space, along_way, find_way, find_ways, go
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import Outcome
 from cnpgen.trajectory.boundary import assemble
@@ -28,45 +28,67 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 
 
 def space_of(problem: Problem) -> Space:
-    tool, task = refiner(problem), between(problem, BESIDE_WALL)
-    return Space(tool.stage, Hulls(problem, load_robot(problem)), *tool.check.bounds_at_rest(task), task.tops)
+    tool, task, robot = refiner(problem), between(problem, BESIDE_WALL), load_robot(problem)
+    return Space(tool.stage, robot, tool.check.bounds_at_rest(task), task.tops, Hulls(problem, robot))
+
+
+def until(hit: Callable[[np.ndarray], np.ndarray]) -> Follow:
+    """Follow states up to the first one that hits something."""
+
+    def follow(q: np.ndarray) -> np.ndarray:
+        hits = hit(q)
+        return q[:, : int(np.argmax(hits))] if hits.any() else q
+
+    return follow
 
 
 def test_a_way_leads_over_a_wall_and_touches_nothing(wall):
-    robot, free = load_robot(wall), space_of(wall).free
-    assert go(*BESIDE_WALL, free) < 1
-    way = find_way(*BESIDE_WALL, robot, free, seed=0)
+    robot, follow = load_robot(wall), space_of(wall).follow
+    assert not go(*BESIDE_WALL, follow)[1]
+    way = find_way(*BESIDE_WALL, robot, follow, seed=0)
     assert np.array_equal(way[[0, -1]], BESIDE_WALL)
+    assert np.abs(np.diff(way, axis=0)).max() < 1.001 * seeds.APART
     meshes = Meshes(wall, robot, wall.path.parent)
-    spans = [np.linspace(a, b, int(np.abs(b - a).max() / 0.02) + 2) for a, b in pairwise(way)]
-    assert min(min(meshes.distances(q)) for q in np.concatenate(spans)) > -0.01  # states are looked at 0.04 rad apart
+    states = np.concatenate([way, (way[1:] + way[:-1]) / 2])  # what was looked at, and what lies between
+    assert min(min(meshes.distances(q)) for q in states) > -0.01
 
 
 def test_a_line_is_free_up_to_the_first_state_that_is_not():
     asked = []
 
-    def free(q: np.ndarray) -> int:
+    def follow(q: np.ndarray) -> np.ndarray:
         asked.append(q.shape[1])
-        return before(q[0] > 1.5)
+        return until(lambda q: q[0] > 1.5)(q)
 
-    assert go(np.zeros(2), np.array([1.4, 1.0]), free) == 1
-    assert go(np.zeros(2), np.array([3.0, 1.0]), free) == pytest.approx(0.5, abs=seeds.APART / 3)
+    states, reached = go(np.zeros(2), np.array([1.4, 1.0]), follow)
+    assert reached
+    np.testing.assert_array_equal(states[-1], [1.4, 1.0])
+    states, reached = go(np.zeros(2), np.array([3.0, 1.0]), follow)
+    assert not reached
+    assert 1.5 - seeds.APART < states[-1, 0] <= 1.5
     assert max(asked) <= seeds.BLOCK
 
 
-def before(hit: np.ndarray) -> int:
-    """How many states come before the first one that hits something."""
-    return int(np.argmax(hit)) if hit.any() else len(hit)
+def test_a_line_ends_where_its_states_leap():
+    states, reached = go(np.zeros(2), np.ones(2), lambda q: np.where(q > 0.5, q + 1.0, q))
+    assert not reached
+    assert 0.5 - seeds.APART < states.max() <= 0.5
 
 
 def test_where_there_is_no_way_none_is_found(wall, monkeypatch):
     monkeypatch.setattr(seeds, "GROWTHS", 50)
-    closed = lambda q: before(np.abs(q[0]) < 0.1)  # noqa: E731
-    assert find_way(*BESIDE_WALL, load_robot(wall), closed, seed=0) is None
+    closed = until(lambda q: np.abs(q[0]) < 0.1)
+    assert list(find_ways(*BESIDE_WALL, load_robot(wall), closed)) == []
+
+
+def test_a_line_that_is_free_is_the_only_way(wall):
+    (way,) = find_ways(*BESIDE_WALL, load_robot(wall), lambda q: q)
+    np.testing.assert_array_equal(way[[0, -1]], BESIDE_WALL)
+    np.testing.assert_allclose(np.diff(way, 2, axis=0), 0, atol=1e-12)
 
 
 def test_a_way_is_the_same_each_time(wall):
-    gate = lambda q: before((np.abs(q[0]) < 0.1) & (q[1] < 0.5))  # noqa: E731
+    gate = until(lambda q: (np.abs(q[0]) < 0.1) & (q[1] < 0.5))
     ways = [find_way(*BESIDE_WALL, load_robot(wall), gate, seed=seed) for seed in (0, 0, 1)]
     assert np.array_equal(ways[0], ways[1])
     assert not np.array_equal(ways[0], ways[2])

@@ -10,10 +10,14 @@ import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.make.dataset import make_dataset
+from cnpgen.planner.detours import Detours
 from cnpgen.planner.model_file import save_model
 from cnpgen.problems.record import record_problem
 from cnpgen.store.files.atomic import file_sha256
+from cnpgen.training import prepare
+from cnpgen.training.rows import prepare_rows as usual
 from cnpgen.training.train import Trained, train_model
+from cnpgen.trajectory.motion import Motion
 from tests.conftest import tiny_recipe
 from tests.examples.models import SMALL
 from tests.examples.plans import PROBLEMS
@@ -38,6 +42,30 @@ def test_the_first_parameters_and_the_features_are_those_of_the_model(first, tmp
     assert found.model.training["start_from"] == file_sha256(first.path)
     with pytest.raises(UsageError, match=re.escape("is another model, it differs in start_from")):
         train_model(rows, out, steps=1, settings=STILL, check_rows=1)
+
+
+def test_rows_are_trained_along_the_lines_that_plans_of_the_first_model_take(first, tmp_path, monkeypatch):
+    corner, seen = (tuple(np.full(6, 0.3).tolist()),), []
+    cornered, rows = tmp_path / "cornered.h5", tmp_path / "rows"
+    save_model(cornered, replace(first.model, meaning=replace(first.model.meaning, middles=corner)))
+    make_dataset(tiny_recipe("airhockey-replan", seed=9), rows, workers=1)
+
+    def noted(*args: object, **options: object) -> object:
+        seen.append((args, options))
+        return usual(*args, **options)
+
+    def by_chance(detours: Detours, motion: Motion, tops: np.ndarray) -> np.ndarray:
+        return 1 + np.sin(1e3 * motion.path[:, 7].sum(axis=1))
+
+    monkeypatch.setattr(prepare, "prepare_rows", noted)
+    monkeypatch.setattr(Detours, "broken", by_chance)
+    found = train_model(rows, tmp_path / "n.h5", steps=1, settings=STILL, start_from=cornered, check_rows=1, workers=1)
+    assert found.model.meaning.middles == corner
+    ((boundary, straight), options) = seen[0]
+    some = boundary[:50]
+    changed = (options["lines"](some).correction != straight(some).correction).any(axis=(1, 2))
+    assert changed.any()
+    assert not changed.all()
 
 
 @pytest.mark.parametrize(
