@@ -101,12 +101,19 @@ def test_plans_in_a_file_are_not_looked_at(tmp_path: Path, rows) -> None:
         ({"goal_q": np.full((3, 6), np.nan)}, {"problem": "airhockey"}, r"goal_q must be finite, got .* in row 0"),
         ({"goal_q": [["a"] * 6] * 3}, {"problem": "airhockey"}, r"goal_q must hold numbers"),
         ({"sample_id": np.array([0.5] * 3)}, {"problem": "airhockey"}, r"sample_id must hold 3 integers"),
+        ({"goal_q": np.zeros((1, 6))}, {"problem": "airhockey"}, r"goal_q has shape \(1, 6\), expected \(3, 6\)"),
+        ({"goal_dq": None, "goal_qd": np.zeros((3, 6))}, {}, r"'goal_qd' is almost 'goal_dq', which the file lacks"),
         ({"hit_angle": np.zeros(2)}, {"problem": "airhockey"}, r"hit_angle must have shape \(3,\)"),
     ],
 )
 def test_a_file_that_cannot_be_meant_is_refused_by_name(write, changed, attributes, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         load_boundary_problems(write(attributes=attributes, **changed))
+
+
+def test_names_that_resemble_none_of_a_boundary_condition_are_passed_over(write) -> None:
+    foreign = {"goal_xyz": np.zeros((3, 3)), "goal_tau": np.zeros(3), "score": np.zeros(3)}
+    assert len(load_boundary_problems(write(goal_dq=None, **foreign), problem="airhockey")) == 3
 
 
 def test_a_problem_that_a_file_is_not_of_is_refused(write) -> None:
