@@ -118,7 +118,9 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         refuse_misspelt(path, names, ASKED)
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
-        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan")
+        tasks = any(name.startswith("goal_xyz") for name in names)
+        hint = "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
+        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}")
     return found
 
 
