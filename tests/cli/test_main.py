@@ -672,7 +672,7 @@ def test_a_full_disk_behind_stdout_is_a_line():
             check=False,
         )
     assert process.returncode == 3
-    assert one_line(process.stderr).endswith("No space left on device")
+    assert one_line(process.stderr) == "cnpgen: error: stdout: No space left on device"
 
 
 def test_closed_streams_are_no_error():
