@@ -133,6 +133,13 @@ def test_a_wrong_value_is_one_line(run, option, value, tmp_path):
     one_line(err)
 
 
+@pytest.mark.parametrize("value", ["nan", "abc", "-5ms", "-.5"])
+def test_a_wrong_time_is_said_once(run, value):
+    expected = f"--deadline: expected a time above 0, such as 0.001 or 1ms; got {value!r}; see"
+    assert expected in one_line(run("refine", "x.h5", "--deadline", value)[2])
+    assert "unknown unit 'mz'" in one_line(run("refine", "x.h5", "--deadline", "5mz")[2])
+
+
 @pytest.mark.parametrize(
     ("words", "hint"),
     [
