@@ -92,7 +92,7 @@ def test_a_hit_without_a_direction_goes_where_the_pipeline_aims(prepare):
     ("column", "value", "reason"),
     [
         ("goal_xyz", [3.0, 0, 0.16], "no hitting configuration"),
-        ("goal_xyz", [1.0, 0.44, 0.16], "the hit leaves the table"),
+        ("goal_xyz", [1.0, 0.44, 0.16], "the hit is off the table, or leaves it"),
         ("hit_speed", [9.0], "hit speed not between 0 and the highest possible one"),
         ("start_dq", [0.1, 0, 0, 0, 0, 0], "not at rest at the start"),
     ],
