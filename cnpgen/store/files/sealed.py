@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import machine_error, read_file, write_file
 from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5, require_possible_size
-from cnpgen.store.files.kind import HDF5, kind_name, seeming
+from cnpgen.store.files.kind import HDF5, kind_name, own_kind, seeming
 from cnpgen.store.files.limits import SEALED_BYTES
 
 BLOCK = 512  # bytes of the seal
@@ -109,12 +109,12 @@ def has_seal(path: Path, *, kind: str, version: int) -> bool:
 def _check_seal(path: Path, block: bytes, digest: str, *, kind: str, version: int) -> None:
     """Refuse a file whose first block is not the right seal for the sha256 of what follows."""
     head, what = _SEAL.match(block), kind_name(kind.removeprefix("cnpgen-"))
-    if head is None and _TRACE.search(block):
-        raise DatasetError(_CHANGED.format(path))
-    if head is None:
+    if head is None and not _TRACE.search(block):
         raise DatasetError(f"{path} is not {what}, or its beginning is damaged{seeming(path)}")
-    if head[1].decode() != kind:
-        raise DatasetError(f"{path} is {kind_name(head[1].decode().removeprefix('cnpgen-'))}, not {what}")
+    if head and head[1].decode() != kind and (other := own_kind(block)):
+        raise DatasetError(f"{path} is {other}, not {what}")
+    if head is None or head[1].decode() != kind:
+        raise DatasetError(_CHANGED.format(path))
     if int(head[2]) > version:
         raise DatasetError(
             f"{path} has format version {int(head[2])}, this cnpgen reads up to {version}: upgrade cnpgen"
