@@ -31,7 +31,7 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
         if recipe not in _shipped() and is_dataset(path):
             raise UsageError(f"{recipe} is the folder of a dataset, expected a recipe: {of_dataset.format(recipe)}")
         return
-    if path.suffix == ".csv" and path.is_file():
+    if path.suffix.lower() == ".csv" and path.is_file():
         hint = f"'cnpgen complete NAME {recipe} -o problems.h5' makes problems of tasks, which 'cnpgen solve' takes"
         raise UsageError(f"{recipe} is a table, expected a recipe: {hint}")
     if kind := file_kind(path):
