@@ -76,13 +76,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     """Read the plans, and join them with those that follow."""
-    from cnpgen.errors import UsageError
+    from cnpgen.errors import UsageError, counted
     from cnpgen.plans.join import join_plans
 
     plans: Plans | JoinedPlans = read_plans(arguments.file)
     following, times = arguments.join or [], arguments.at or []
     if times and len(times) != len(following):
-        raise UsageError(f"--at is given {len(times)} times, --join {len(following)} times: expected one for each")
+        given = f"--at is given {counted(len(times), 'time')}, --join {counted(len(following), 'time')}"
+        raise UsageError(f"{given}: expected one for each")
     for file, time in zip(following, times or [None] * len(following), strict=True):
         plans = join_plans(plans, read_plans(file), at=time)
     return plans

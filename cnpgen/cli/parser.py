@@ -6,6 +6,7 @@ options a parser knows, or of which types what it returns is. This module alone 
 """
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -13,6 +14,9 @@ from cnpgen.errors import UsageError, nearest
 
 Command = Callable[[argparse.Namespace], int]
 """What a command runs: a function of the parsed arguments that returns the exit code."""
+
+
+_NEGATIVE = re.compile(r"-\.?[0-9]")  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -32,6 +36,7 @@ class Parser(argparse.ArgumentParser):
             formatter_class=_Help,
             **options,
         )
+        self._negative_number_matcher = _NEGATIVE
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError: what is wrong and where to read more, on one line."""

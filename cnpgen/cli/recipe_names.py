@@ -13,7 +13,7 @@ _HINTS = {  # what a file is -> what to do with it
 
 
 def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
-    """Refuse the folder of a dataset and HDF5 files, before they are looked for, or read, as recipes.
+    """Refuse the folder of a dataset, tables and HDF5 files, before they are looked for, or read, as recipes.
 
     Args:
         recipe: Name or path.
@@ -31,6 +31,9 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
         if recipe not in _shipped() and is_dataset(path):
             raise UsageError(f"{recipe} is the folder of a dataset, expected a recipe: {of_dataset.format(recipe)}")
         return
+    if path.suffix.lower() == ".csv" and path.is_file():
+        hint = f"'cnpgen complete NAME {recipe} -o problems.h5' makes problems of tasks, which 'cnpgen solve' takes"
+        raise UsageError(f"{recipe} is a table, expected a recipe: {hint}")
     if kind := file_kind(path):
         what = kind if kind in {"an HDF5 file", "a journal of cnpgen"} else f"an HDF5 file, {kind}"
         hint = _HINTS.get(kind, "'cnpgen list' names the recipes that there are").format(recipe)

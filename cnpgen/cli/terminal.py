@@ -35,8 +35,23 @@ class Printable:
 
     def write(self, text: str) -> int:
         """Write a text."""
-        self.terminal.write(printable(text))
+        with self._named():
+            self.terminal.write(printable(text))
         return len(text)
+
+    def flush(self) -> None:
+        """Write what is still to be written."""
+        with self._named():
+            self.terminal.flush()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Say of an error which stream it is of: a disk may be full behind it."""
+        try:
+            yield
+        except OSError as error:
+            error.filename = error.filename or str(getattr(self.terminal, "name", "")).strip("<>")
+            raise
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.terminal, name)

@@ -114,7 +114,8 @@ def _quantity(text: str, unit: str, expected: str) -> float:
     try:
         number = parse_number(text, unit)
     except ValueError as error:
-        raise ArgumentTypeError(f"expected {expected}; got {text!r}: {error}") from error
+        more = "" if str(error).startswith("expected") else f": {error}"
+        raise ArgumentTypeError(f"expected {expected}; got {text!r}{more}") from error
     if number <= 0:
         raise ArgumentTypeError(f"expected {expected}; got {text!r}")
     return number

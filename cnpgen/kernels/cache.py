@@ -5,6 +5,7 @@ is refused, a single file likewise is as if it were not there.
 """
 
 import atexit
+import errno
 import os
 import shutil
 import stat
@@ -78,8 +79,10 @@ def make_private(folder: Path) -> None:
         if not each.is_dir():
             try:
                 each.mkdir()
-            except FileExistsError:  # made by another process meanwhile, or a file
-                continue
+            except FileExistsError as error:  # made by another process meanwhile, or a file
+                if each.is_dir():
+                    continue
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(each)) from error
             each.chmod(stat.S_IRWXU)
 
 

@@ -1,19 +1,20 @@
 """Completing tasks that users give: positions to reach and directions to hit in, for boundary problems to solve."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError, counted
+from cnpgen.errors import DatasetError, UsageError, counted
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.task_table import read_tasks
-from cnpgen.pipelines.completion import Completion, given_fields
-from cnpgen.pipelines.context import load_context
+from cnpgen.pipelines.completion import Completion, given_fields, table_height
+from cnpgen.pipelines.context import Context, load_context
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.steps import steps_of
 from cnpgen.plans.boundary_problems import plans_of_rows
@@ -69,7 +70,11 @@ def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayL
         MachineError: No backend works.
     """
     pipeline = _pipeline(recipe)
-    completion = Completion(pipeline, load_context(pipeline.problem, *choose_backend(None)), columns)
+    return _completed(pipeline, load_context(pipeline.problem, *choose_backend(None)), columns)
+
+
+def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, ArrayLike]) -> Completed:
+    completion = Completion(pipeline, context, columns)
     flat = completion.height is not None
     given = {name: _rows(completion.given[name], values, flat=flat) for name, values in columns.items()}
     count = max(map(len, given.values()))
@@ -90,14 +95,19 @@ def complete_table(recipe: str | Path | Pipeline | DatasetRecipe, path: str | Pa
         path: The table.
 
     Raises:
-        UsageError: There is no such file, or a goal is missing.
-        DatasetError: The table is damaged, or has columns that tasks cannot give.
+        UsageError: There is no such file.
+        DatasetError: The table is damaged, lacks a goal, or has columns that tasks cannot give, or not together.
         RecipeError: The recipe has mistakes.
         MachineError: No backend works, or the file cannot be read.
     """
     pipeline = _pipeline(recipe)
     context = load_context(pipeline.problem, *choose_backend(None))
-    return complete(pipeline, **read_tasks(Path(path), given_fields(steps_of(pipeline), context)))
+    fields, flat = given_fields(steps_of(pipeline), context), table_height(context) is not None
+    tasks = read_tasks(Path(path), fields, flat=flat)
+    try:
+        return _completed(pipeline, context, tasks)
+    except UsageError as error:
+        raise DatasetError(f"{path}: {error}") from error
 
 
 def _pipeline(recipe: str | Path | Pipeline | DatasetRecipe) -> Pipeline:

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, MachineError, UsageError, nearest
+from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import is_hdf5
 from cnpgen.store.files.limits import TABLE_BYTES, TABLE_COLUMNS
@@ -18,27 +19,30 @@ from cnpgen.store.paths import require_file
 Array = NDArray[np.float64]
 
 
-def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
+def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[str, Array]:
     """Read tasks from a table.
 
     Args:
         path: A table of CSV, whose first line names the columns, or a file of HDF5, whose datasets are columns, or
             whole fields of shape (N, width). Numbers are in SI.
         fields: What tasks may give: name -> field.
+        flat: Whether positions are on a table: they may be without z.
 
     Returns:
         Name -> values, shape (N,) or (N, width); of a position without its z, shape (N, 2).
 
     Raises:
         UsageError: There is no such file.
-        DatasetError: It is damaged, or has a column that no task can give, or something that is no number.
+        DatasetError: It is damaged or has no task, or a column that no task can give, or something that is no number.
         MachineError: The system would not let us read it.
     """
     require_file(path, "a table of tasks, CSV or HDF5")
     try:
         columns = _hdf5_columns(path) if is_hdf5(path) else _csv_columns(path)
     except OSError as error:
-        raise MachineError(f"{path}: {error.strerror or error}") from error
+        raise machine_error("read", path, error) from error
+    if columns and not any(values.size for values in columns.values()):
+        raise DatasetError(f"{path} has no tasks: it names columns ({', '.join(columns)}), but has no numbers")
     known = {**fields, **{column: field for field in fields.values() for column in field.columns}}
     for name, values in columns.items():
         if name not in known:
@@ -50,7 +54,7 @@ def read_tasks(path: Path, fields: Mapping[str, Field]) -> dict[str, Array]:
     for field in fields.values():
         parts = [column for column in field.columns if field.width and column in columns]
         if parts:
-            found[field.name] = _joined(path, field, parts, columns)
+            found[field.name] = _joined(path, field, parts, columns, flat=flat)
     return found
 
 
@@ -59,10 +63,10 @@ def _unknown(path: Path, name: str, fields: Mapping[str, Field]) -> str:
     return f"{path}: tasks of this pipeline cannot give {name!r}{hint or ', only ' + ', '.join(fields)}"
 
 
-def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array]) -> Array:
+def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array], *, flat: bool) -> Array:
     """Join the components of a field; a position on a table needs no height."""
     missing = [column for column in field.columns if column not in parts]
-    if missing and not (field.name.endswith("_xyz") and missing == [f"{field.name}.z"]):
+    if missing and not (flat and field.name.endswith("_xyz") and missing == [f"{field.name}.z"]):
         raise DatasetError(f"{path} lacks {', '.join(missing)} beside {', '.join(parts)}")
     return np.stack([columns[name] for name in parts], axis=1)
 
@@ -91,6 +95,8 @@ def _csv_columns(path: Path) -> dict[str, Array]:
     if not lines:
         raise DatasetError(f"{path} is empty: its first line must name columns, such as goal_xyz.x,goal_xyz.y")
     names = [cell.strip() for cell in lines[0][1]]
+    if other := next((mark for mark in ";\t" if mark in "".join(names)), None):
+        raise DatasetError(f"{path}: line 1: columns are separated by ',', got {other!r}; numbers have '.', as in 0.5")
     if len(names) > TABLE_COLUMNS:
         raise DatasetError(f"{path}: line 1 names {len(names):,} columns, expected at most {TABLE_COLUMNS:,}")
     if twice := [name for name in names if names.count(name) > 1]:

@@ -4,12 +4,12 @@ from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
-from cnpgen.errors import RecipeError, UsageError, lacks
+from cnpgen.errors import UsageError, lacks
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.stage import Array, Stage, TaskRound, Work
+from cnpgen.pipelines.stages.stage import Array, TaskRound, Work
 from cnpgen.pipelines.steps import Step, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
@@ -44,7 +44,7 @@ class Completion:
         _check(pipeline, fields, given)
         self.context, self.given = context, {name: fields[name] for name in given}
         self._fields = stored_fields(steps, context)[:-2]  # without those about draws
-        self.height = _table_height(context)
+        self.height = table_height(context)
         self._derived = _derived(given)
         known = {*given, *self._derived}
         written = written_columns(pipeline.path, steps, context)
@@ -100,7 +100,7 @@ class Completion:
         return np.concatenate([values, np.full((1, values.shape[1]), self.height)])
 
 
-def _table_height(context: Context) -> float | None:
+def table_height(context: Context) -> float | None:
     """Return the height of the tip that positions on the problem's table have [m]; None where there is no table."""
     table = context.problem.first(Table)
     return None if table is None else table.z
@@ -152,12 +152,5 @@ def _of_tasks(steps: Iterable[Step], context: Context) -> list[Step]:
 
 
 def _completing(steps: Iterable[Step], context: Context, known: Collection[str]) -> list[tuple[str, Work]]:
-    """Prepare the stages; say of which one it is what is wrong with what is given."""
-
-    def prepare(stage: Stage) -> Work:
-        try:
-            return stage.complete(context, known)
-        except UsageError as error:
-            raise RecipeError([str(error)]) from error
-
-    return prepare_steps(list(steps), prepare)
+    """Prepare the stages for what is given."""
+    return prepare_steps(list(steps), lambda stage: stage.complete(context, known))

@@ -245,7 +245,7 @@ def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
         Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
 
     Raises:
-        UsageError: There are not as many times as plans, or one is not within its plan.
+        UsageError: There are not as many times as plans, one is not within its plan, or a plan is still to be made.
     """
     try:
         times = np.broadcast_to(numbers("time", time), (len(plans),))
@@ -254,6 +254,8 @@ def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
     outside = ~((times >= 0) & (times <= plans.duration))
     if outside.any():
         row = int(outside.argmax())
+        if np.isnan(plans.path_control_points[row]).all():
+            raise UsageError(f"plan {row} has no control points yet: solve_plans(plans) makes them")
         raise UsageError(
             f"plan {row} lasts from 0 to {plans.duration[row]:.6g} s, it cannot be evaluated at {times[row]:.6g} s"
         )

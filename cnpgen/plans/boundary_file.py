@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.plans.format import ATTRIBUTES, CONDITIONS
+from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, refuse_misspelt
 from cnpgen.plans.format import FORMAT as PLANS
 from cnpgen.plans.format import FORMAT_VERSION as PLANS_VERSION
 from cnpgen.plans.load import stored_problem
@@ -102,7 +102,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
 
     Raises:
         UsageError: There is no such file.
-        DatasetError: It is damaged, something else, or lacks something.
+        DatasetError: It is damaged, something else, or lacks something, or a name in it is almost one that it lacks.
         MachineError: The system would not let us read it.
     """
     require_file(path, "a dataset or an HDF5 file of boundary conditions")
@@ -112,10 +112,16 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     with opened_hdf5(path) as file:
         attributes = file.attributes.some(SAID)
         columns = {name: file[name].read() for name in ASKED if name in file}
+        names = file.names()
+    found = BoundaryFile(path, attributes, columns, sealed)
+    if not sealed and not found.is_shard:  # what cnpgen has written is as it is meant
+        refuse_misspelt(path, names, ASKED)
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
-        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan")
-    return BoundaryFile(path, attributes, columns, sealed)
+        tasks = any(name.startswith("goal_xyz") for name in names)
+        hint = "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
+        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}")
+    return found
 
 
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:
@@ -123,13 +129,18 @@ def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boun
 
     Args:
         where: Where they are from, for messages.
-        columns: Name -> values, shape (N, n).
+        columns: Name -> values, shape (N, n); N is the same for all.
         n: Number of planned joints.
 
     Raises:
         DatasetError: A shape is wrong, or something is not finite.
     """
+    given = {name: columns[name] for name in CONDITIONS if name in columns}
     try:
-        return boundary_of(n, *(columns.get(name) for name in CONDITIONS))  # type: ignore[arg-type]
+        boundary = boundary_of(n, *map(given.get, CONDITIONS))  # type: ignore[arg-type]
     except UsageError as error:
         raise DatasetError(f"{where}: {error}") from error
+    for name, values in given.items():  # in files one row does not hold for all
+        if values.size != len(boundary) * n:
+            raise DatasetError(f"{where}: {name} has shape {values.shape}, expected ({len(boundary)}, {n})")
+    return boundary

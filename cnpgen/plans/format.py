@@ -1,5 +1,10 @@
 """What a plan file holds: names, units and meanings of its datasets (docs/plan-format.md)."""
 
+import difflib
+from collections.abc import Collection
+from pathlib import Path
+
+from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 from cnpgen.store.joint_units import units_of_joints
 
@@ -16,6 +21,7 @@ NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
 UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # of joints that turn
+ALMOST = 0.8  # likeness of names, of 1, from which on one is taken for a slip of the other
 _MEANINGS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}
 _OTHERS = (
     Field("rate_control_points", "1/s", "control points of the rate r(s) = ds/dt"),
@@ -47,3 +53,24 @@ def plan_fields(joints: tuple[str, ...], sliding: tuple[bool, ...]) -> dict[str,
     name, unit = "path_control_points", units_of_joints(UNITS["q"], sliding)
     fields[name] = Field(name, unit, "control points of the path p(s)", names=joints)
     return fields
+
+
+KNOWN = frozenset(plan_fields((), ()))  # names that have a meaning of their own
+
+
+def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) -> None:
+    """Refuse a file with a dataset that is called almost as one which may be left out, and is: it would be ignored.
+
+    Args:
+        path: The file, for the message.
+        names: The datasets that it has.
+        asked: The names that are looked for.
+
+    Raises:
+        DatasetError: There is such a dataset.
+    """
+    missing = [name for name in asked if name not in names]
+    for name in names:
+        meant = difflib.get_close_matches(name.lower(), missing, n=1, cutoff=ALMOST)
+        if meant and name not in KNOWN:
+            raise DatasetError(f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it")

@@ -9,7 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
-from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, FLOATS, FORMAT, FORMAT_VERSION, INTEGERS, NOTES, REQUIRED
+from cnpgen.plans.format import (
+    ATTRIBUTES,
+    CONDITIONS,
+    FLOATS,
+    FORMAT,
+    FORMAT_VERSION,
+    INTEGERS,
+    KNOWN,
+    NOTES,
+    REQUIRED,
+    refuse_misspelt,
+)
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import settle_tips
@@ -52,6 +63,8 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
         columns = _columns(path, file)
+    if not sealed:
+        refuse_misspelt(path, columns, CONDITIONS)
     record = agreed_problem(path, stored_problem(path, attributes), wanted, content="plans", command="evaluate")
     try:
         plans = _assembled(path, record, columns, attributes)
@@ -63,7 +76,7 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
 def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
     """Read the datasets of a file."""
     columns = {name: _read(path, name, item) for name, item in file.columns().items()}
-    missing = [name + nearest(name, columns.keys() - {*REQUIRED}) for name in REQUIRED if name not in columns]
+    missing = [name + nearest(name, columns.keys() - KNOWN) for name in REQUIRED if name not in columns]
     if missing:
         raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
     if "status" in columns:

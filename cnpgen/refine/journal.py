@@ -14,7 +14,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, UsageError, counted
+from cnpgen.errors import UsageError, counted
 from cnpgen.refine.task import Outcome, Refined
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.documents import differences, parse_json
@@ -80,12 +80,12 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
     try:
         file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")
     except OSError as error:
-        raise MachineError(f"{path}: {error.strerror or error}") from error
+        raise machine_error("write", path, error) from error
     try:
         return _begin(path, file, identity, discard=discard)
     except OSError as error:
         file.close()
-        raise MachineError(f"{path}: {error.strerror or error}") from error
+        raise machine_error("write", path, error) from error
     except BaseException:
         file.close()
         raise

@@ -37,11 +37,11 @@ class RefineOptions:
         if self.objective not in OBJECTIVES:
             expected = f"expected one of {', '.join(OBJECTIVES)}{nearest(self.objective, OBJECTIVES)}"
             raise UsageError(f"objective {self.objective!r} does not exist: {expected}")
-        if self.weight is not None and number("weight", self.weight) < 0:
-            raise UsageError(f"the weight of an objective must not be negative, got {self.weight}")
+        if self.weight is not None and number("weight=", self.weight) < 0:
+            raise UsageError(f"weight= must not be negative, got {self.weight}")
         integer("max_iterations", self.max_iterations, least=0)
-        if not 0 < number("tolerance", self.tolerance) < 1:
-            raise UsageError(f"tolerance must be between 0 and 1, got {self.tolerance}")
+        if not 0 < number("tolerance=", self.tolerance) < 1:
+            raise UsageError(f"tolerance= must be above 0 and below 1, got {self.tolerance}")
         if self.deadline is not None and number("deadline", self.deadline) <= 0:
             raise UsageError(f"the deadline must be above 0 s, got {self.deadline}")
 

@@ -53,6 +53,11 @@ class Inspection:
         return self.sealed and not self.summary.problems and not self.damage
 
     @property
+    def damaged(self) -> bool:
+        """Whether what was looked at is not as it was made."""
+        return self.sealed and not self.complete
+
+    @property
     def state(self) -> str:
         """The state of the dataset in a few words."""
         if self.complete:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,7 +15,8 @@ from pathlib import Path
 import pytest
 
 import cnpgen
-from cnpgen.cli.interruption import Terminated, exit_code, interruptible, raise_if_interrupted
+import cnpgen.__main__
+from cnpgen.cli.interruption import INTERRUPTED, Terminated, exit_code, interruptible, raise_if_interrupted
 from cnpgen.cli.main import main
 from cnpgen.kernels.compiled import find_compiler
 from tests.conftest import HANGING, some
@@ -31,6 +33,19 @@ linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /
 def _compiled(tiny) -> None:
     """Have the kernels in the cache: compiling them is announced."""
     tiny("airhockey-hit")
+
+
+class _Interrupting(types.ModuleType):
+    """A module that is interrupted while something is imported from it."""
+
+    def __getattr__(self, name: str) -> None:
+        raise KeyboardInterrupt
+
+
+def test_an_interruption_of_the_imports_is_a_line(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "cnpgen.cli.main", _Interrupting("cnpgen.cli.main"))
+    assert cnpgen.__main__.main() == INTERRUPTED == 130
+    assert capsys.readouterr().err == "cnpgen: interrupted\n"
 
 
 def descendants(pid: int) -> list[int]:

@@ -133,6 +133,13 @@ def test_a_wrong_value_is_one_line(run, option, value, tmp_path):
     one_line(err)
 
 
+@pytest.mark.parametrize("value", ["nan", "abc", "-5ms", "-.5"])
+def test_a_wrong_time_is_said_once(run, value):
+    expected = f"--deadline: expected a time above 0, such as 0.001 or 1ms; got {value!r}; see"
+    assert expected in one_line(run("refine", "x.h5", "--deadline", value)[2])
+    assert "unknown unit 'mz'" in one_line(run("refine", "x.h5", "--deadline", "5mz")[2])
+
+
 @pytest.mark.parametrize(
     ("words", "hint"),
     [
@@ -483,7 +490,8 @@ def test_a_file_that_is_not_there_or_not_toml_is_one_line(run, tmp_path):
 def test_inspect_shows_rows_ranges_and_yield(run, hits):
     code, out, err = run("inspect", hits)
     assert (code, err) == (0, "")
-    for text in ("complete", "200: train 182, validation 18", "too close together", "joint_6", "rad/s^2", "100.00 %"):
+    state = "complete; checksums of the shards were not looked at, 'cnpgen validate' does"
+    for text in (state, "200: train 182, validation 18", "too close together", "joint_6", "rad/s^2", "100.00 %"):
         assert text in out
     assert max(len(line) for line in out.splitlines()) <= 100
 
@@ -504,6 +512,15 @@ def test_a_picture_in_a_folder_that_is_not_there_is_refused_before_any_work(run,
         code, out, err = run("inspect", hits, "--plot", tmp_path / folder / "hits.png")
         assert (code, out) == (2, "")
         assert "--plot: expected a file in a folder that is there, got " in one_line(err)
+
+
+def test_inspect_of_a_damaged_dataset_is_1(run, hits, tmp_path):
+    folder = shutil.copytree(hits, tmp_path / "damaged")
+    (folder / "manifest.json").write_text("{}", encoding="utf-8")
+    code, out, _ = run("inspect", folder)
+    assert code == 1
+    assert "damaged: manifest.json: " in out
+    assert run("inspect", folder, "--json")[0] == 1
 
 
 def test_inspect_works_on_an_unfinished_dataset(run, hits, tmp_path):
@@ -662,7 +679,7 @@ def test_a_full_disk_behind_stdout_is_a_line():
             check=False,
         )
     assert process.returncode == 3
-    assert one_line(process.stderr).endswith("No space left on device")
+    assert one_line(process.stderr) == "cnpgen: error: stdout: No space left on device"
 
 
 def test_closed_streams_are_no_error():

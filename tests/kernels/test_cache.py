@@ -83,6 +83,11 @@ def test_a_folder_that_can_be_written_is_taken_without_a_word(tmp_path):
         assert usable_folder(tmp_path / "new") == tmp_path / "new"
 
 
+def test_a_file_in_the_place_of_the_folder_is_said_to_be_none(unwritable):
+    with pytest.warns(RuntimeWarning, match=rf"cannot write the kernel cache {unwritable.parent} \(Not a directory\)"):
+        assert usable_folder(unwritable.parent).is_dir()
+
+
 @needs_compiler
 def test_kernels_are_compiled_in_a_temporary_folder_after_one_warning(unwritable, monkeypatch, fresh_compiler):
     monkeypatch.setenv("CNPGEN_CACHE", str(unwritable))

@@ -1,6 +1,7 @@
 """Completing tasks from Python and from tables: problems to solve, which task each is, what is wrong with a table."""
 
 import os
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 
 import cnpgen
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.kernels.library import choose_backend
 from cnpgen.make.complete import complete, complete_table
 
 GOALS = [[1.0, 0.1], [3.0, 0.0], [1.1, -0.2]]  # m; the second is out of reach
 ANGLES = [0.0, 0.1, 0.2]  # rad
+BOTH = "".join(f"start_q.joint_{joint}," for joint in range(1, 7)) + "goal_xyz.x,goal_xyz.y,"
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +89,11 @@ def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("goal_xyz.x,goal_xyz.y\n", "tasks.csv has no tasks: it names columns (goal_xyz.x, goal_xyz.y), but has no"),
+        ("hit_angle\n1\n", "tasks.csv: tasks of the pipeline 'airhockey-replan' must give goal_xyz"),
+        (f"{BOTH}start_xyz.x,start_xyz.y\n{'1,' * 8}1,1\n", "tasks.csv: start_q and start_xyz are both given"),
+        ("goal_xyz.x,goal_xyz.y,hit_speed,hit_speed_share\n1,0,1,1\n", "tasks.csv: hit_speed and hit_speed_share both"),
+        ("goal_xyz.x;goal_xyz.y\n1,0;0,5\n", "tasks.csv: line 1: columns are separated by ',', got ';'"),
         ("", "is empty: its first line must name columns"),
         ("goal_xyz.x,goal_xyz.w\n1,2\n", "cannot give 'goal_xyz.w' (did you mean 'goal_xyz."),
         ("colour,goal_xyz.y\n1,2\n", "cannot give 'colour', only start_xyz, goal_xyz, start_q"),
@@ -106,6 +114,13 @@ def test_a_table_with_a_mistake_is_refused_with_the_place(tmp_path, text, messag
     assert message in str(error.value)
 
 
+def test_a_machine_without_a_compiler_is_warned_of_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("cnpgen.make.complete.choose_backend", once := Mock(side_effect=choose_backend))
+    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,0\n", encoding="utf-8")
+    complete_table("airhockey-replan", tmp_path / "tasks.csv")
+    once.assert_called_once()
+
+
 def test_a_table_of_nothing_but_a_size_is_refused(tmp_path):
     (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,2\n", encoding="utf-8")
     os.truncate(tmp_path / "tasks.csv", 1 << 40)
@@ -113,10 +128,10 @@ def test_a_table_of_nothing_but_a_size_is_refused(tmp_path):
         complete_table("airhockey-replan", tmp_path / "tasks.csv")
 
 
-def test_a_table_without_tasks_is_refused(tmp_path):
-    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n", encoding="utf-8")
-    with pytest.raises(UsageError, match="goal_xyz is of no task"):
-        complete_table("airhockey-replan", tmp_path / "tasks.csv")
+def test_a_table_without_heights_is_refused_where_no_table_gives_them(tmp_path):
+    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,0\n", encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"tasks\.csv lacks goal_xyz\.z beside goal_xyz\.x, goal_xyz\.y"):
+        complete_table("heavy-object", tmp_path / "tasks.csv")
 
 
 def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_path):

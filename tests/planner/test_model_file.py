@@ -106,6 +106,16 @@ def test_a_model_that_was_cut_off_is_an_error(model, tmp_path, size):
         load_model(tmp_path / "m.h5")
 
 
+@pytest.mark.parametrize("place", [3, 9, 20, 40, 200])
+def test_a_model_whose_first_block_was_changed_is_called_damaged_and_nothing_else(model, tmp_path, place):
+    save_model(tmp_path / "m.h5", model)
+    data = bytearray((tmp_path / "m.h5").read_bytes())
+    data[place] ^= 0x10 if place != 9 else 0x02  # "mmdel"
+    (tmp_path / "m.h5").write_bytes(data)
+    with pytest.raises(DatasetError, match=r"m\.h5 is damaged: its first 512 bytes are not as they were written$"):
+        load_model(tmp_path / "m.h5")
+
+
 def test_a_missing_file_and_other_files_are_named(tmp_path, tiny):
     with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
         load_model(tmp_path / "none.h5")

@@ -184,6 +184,10 @@ def test_a_moment_outside_of_the_plan_is_refused(planner, rows):
         planner.replan(plans, -0.1, goal_q=rows.goal_q)
     with pytest.raises(UsageError, match="cannot be evaluated at 100 s"):
         states_at(plans, 100.0)
+    path, rate = plans.path_control_points * np.nan, plans.rate_control_points * np.nan
+    unsolved = replace(plans, path_control_points=path, rate_control_points=rate)
+    with pytest.raises(UsageError, match="plan 0 has no control points yet"):
+        planner.replan(unsolved, 0.1, goal_q=rows.goal_q)
 
 
 def test_a_model_of_motions_from_rest_refuses_moving_starts(tiny, rows):

@@ -101,12 +101,19 @@ def test_plans_in_a_file_are_not_looked_at(tmp_path: Path, rows) -> None:
         ({"goal_q": np.full((3, 6), np.nan)}, {"problem": "airhockey"}, r"goal_q must be finite, got .* in row 0"),
         ({"goal_q": [["a"] * 6] * 3}, {"problem": "airhockey"}, r"goal_q must hold numbers"),
         ({"sample_id": np.array([0.5] * 3)}, {"problem": "airhockey"}, r"sample_id must hold 3 integers"),
+        ({"goal_q": np.zeros((1, 6))}, {"problem": "airhockey"}, r"goal_q has shape \(1, 6\), expected \(3, 6\)"),
+        ({"goal_dq": None, "goal_qd": np.zeros((3, 6))}, {}, r"'goal_qd' is almost 'goal_dq', which the file lacks"),
         ({"hit_angle": np.zeros(2)}, {"problem": "airhockey"}, r"hit_angle must have shape \(3,\)"),
     ],
 )
 def test_a_file_that_cannot_be_meant_is_refused_by_name(write, changed, attributes, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         load_boundary_problems(write(attributes=attributes, **changed))
+
+
+def test_names_that_resemble_none_of_a_boundary_condition_are_passed_over(write) -> None:
+    foreign = {"goal_xyz": np.zeros((3, 3)), "goal_tau": np.zeros(3), "score": np.zeros(3)}
+    assert len(load_boundary_problems(write(goal_dq=None, **foreign), problem="airhockey")) == 3
 
 
 def test_a_problem_that_a_file_is_not_of_is_refused(write) -> None:
@@ -147,6 +154,8 @@ def test_solve_makes_plans_for_a_file_of_boundary_conditions(rows, write, tmp_pa
     [
         (["tasks.h5"], "tasks.h5 does not say its problem: set its attribute 'problem' to a name or a file, or pass"),
         (["tasks.h5", "--n", "2"], "--split, --first and --n are for the folder of a dataset, got a file"),
+        (["tasks.csv", "--n", "2"], "tasks.csv is a table, expected a recipe: 'cnpgen complete NAME tasks.csv -o"),
+        (["pucks.h5"], "pucks.h5 lacks start_q and goal_q: boundary conditions are needed to plan; of tasks in the"),
         (["tasks.h5", "--seed", "2"], "--seed is for fresh draws of a recipe, got a file of boundary conditions"),
         (["airhockey-hit", "--n", "1", "--problem", "airhockey"], "--problem is for boundary conditions in HDF5"),
         (["empty.h5", "--problem", "airhockey"], "no boundary conditions in empty.h5"),
@@ -158,9 +167,12 @@ def test_options_of_solve_that_mean_nothing_for_what_is_given_are_refused(
     monkeypatch.chdir(tmp_path)
     write("tasks.h5")
     write("empty.h5", **dict.fromkeys(CONDITIONS, np.zeros((0, 6))))
+    write("pucks.h5", **dict.fromkeys(CONDITIONS), goal_xyz=np.zeros((1, 3)))
+    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,0\n", encoding="utf-8")
+    before = sorted(tmp_path.iterdir())
     assert main(["solve", *words]) in {1, 2}
     assert f"cnpgen: error: {line}" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.h5", "tasks.h5"]
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_the_folder_of_a_dataset_may_be_called_as_a_file(tiny: Callable[[str], Path], tmp_path: Path) -> None:

@@ -129,9 +129,9 @@ def test_objectives_are_chosen_by_name_and_nonsense_is_refused() -> None:
     assert choose_criterion(problem, "jerk", 0.2) == Criterion("jerk", 0.2)
     with pytest.raises(UsageError, match=r"objective 'tiem' .*did you mean 'time'"):
         RefineOptions(objective="tiem")
-    with pytest.raises(UsageError, match="weight of an objective"):
+    with pytest.raises(UsageError, match="weight= must not be negative, got -1"):
         RefineOptions(objective="effort", weight=-1.0)
-    with pytest.raises(UsageError, match="tolerance must be between 0 and 1, got 0"):
+    with pytest.raises(UsageError, match="tolerance= must be above 0 and below 1, got 0"):
         RefineOptions(tolerance=0)
     with pytest.raises(UsageError, match=r"max_iterations must be an integer from 0 on, got 2\.5"):
         RefineOptions(max_iterations=2.5)  # type: ignore[arg-type]

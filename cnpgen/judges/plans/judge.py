@@ -119,14 +119,14 @@ class Judge:
         ]
 
 
-def check_step(step: float, most: float = LONGEST_STEP) -> None:
-    """Refuse a time step [s] that is not above 0 and at most ``most``.
+def check_step(step: float) -> None:
+    """Refuse a time step [s] that is not above 0 and at most ``LONGEST_STEP``.
 
     Raises:
         UsageError: It does not.
     """
-    if not 0 < step <= most:
-        raise UsageError(f"the time step must be above 0 and at most {most:g} s, got {step:g} s")
+    if not 0 < step <= LONGEST_STEP:
+        raise UsageError(f"the time step must be above 0 and at most {LONGEST_STEP:g} s, got {step:g} s")
 
 
 @dataclass(frozen=True)

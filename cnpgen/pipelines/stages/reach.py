@@ -1,5 +1,6 @@
 """Stage: the paper's ballistic reach rule, straight lines along the tip's velocity that must stay over the table."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +43,14 @@ class BallisticReach(Stage):
 
     def prepare(self, context: Context) -> Work:
         """Load the kernel."""
+        return self._require(context, "leaves the table")
+
+    def complete(self, context: Context, given: Collection[str]) -> Work:
+        """Load the kernel; tasks, unlike draws, may begin or end anywhere."""
+        del given
+        return self._require(context, "is off the table, or leaves it")
+
+    def _require(self, context: Context, reason: str) -> Work:
         table = context.constraint(Table)
         sides = [[side.low, side.high] for side in (table.x, table.y)]
         over = context.kernels.load(over_table, sides=sides)
@@ -50,10 +59,10 @@ class BallisticReach(Stage):
             if self.start_time:
                 way = self.start_time * draws["start_tip_velocity"][:2]
                 ahead, _ = over(draws["start_xyz"][:2], way)
-                draws.reject(ahead[0] > 0, "the start leaves the table")
+                draws.reject(ahead[0] > 0, f"the start {reason}")
             if self.goal_time:
                 _, both = over(draws["goal_xyz"][:2], self.goal_time * hit_velocity(draws))
-                draws.reject(both[0] > 0, "the hit leaves the table")
+                draws.reject(both[0] > 0, f"the hit {reason}")
 
         return work
 

@@ -99,10 +99,7 @@ class Hdf5:
         """Yield the names of what is not a group, whether it can be given or not."""
         from h5py import h5g
 
-        if (count := len(self._root)) > MOST_NAMES:
-            raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MOST_NAMES:,}")
-        names = [decoded(self.path, name) for name in self._root]
-        return (name for name in names if not isinstance(self._open(name), h5g.GroupID))
+        return (name for name in self.names() if not isinstance(self._open(name), h5g.GroupID))
 
     def __contains__(self, name: str) -> bool:
         return name.encode() in self._root
@@ -117,6 +114,12 @@ class Hdf5:
         if name not in self._given:
             self._given[name] = self._checked(name, self._open(name))
         return self._given[name]
+
+    def names(self) -> list[str]:
+        """Return the names of all that is at the root, groups and links included."""
+        if (count := len(self._root)) > MOST_NAMES:
+            raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MOST_NAMES:,}")
+        return [decoded(self.path, name) for name in self._root]
 
     def columns(self) -> Mapping[str, Column]:
         """Return every dataset; see ``__getitem__``."""

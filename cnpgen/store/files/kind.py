@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
-_OURS = re.compile(rb"cnpgen[- ]([a-z]+) [0-9]")  # of plans, models and checkpoints, and of journals
+_OURS = re.compile(rb"cnpgen[- ](plans|model|checkpoint|proposals|journal) [0-9]")
 _SIGNATURES = {
     HDF5: "an HDF5 file",
     b"PK\x03\x04": "a zip archive, as .npz files are",
