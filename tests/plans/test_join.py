@@ -145,4 +145,4 @@ def test_the_command_joins_files_and_refuses_jumps(three, tmp_path, monkeypatch,
     assert main([*command, "--at", "1ms", "--force"]) == 2
     assert "cannot be joined: q jumps by" in capsys.readouterr().err
     assert main([*command, "--at", "1ms", "--at", "2ms", "--force"]) == 2
-    assert "--at is given 2 times, --join 1 times" in capsys.readouterr().err
+    assert "--at is given 2 times, --join 1 time:" in capsys.readouterr().err
