@@ -346,8 +346,8 @@ def test_plans_without_success_are_named_and_the_exit_code_is_1(
         (["refine", "nowhere.h5"], "nowhere.h5"),
         (["solve", "airhockey-hit", "--n", "2", "-o", "."], "must be a file in a folder that exists"),
         (["solve", "airhockey-hit", "--n", "2", "-o", "no/where.h5"], "must be a file in a folder that exists"),
-        (["solve", "airhockey-hit", "--n", "2", "--tolerance", "2"], "tolerance must be between 0 and 1"),
-        (["solve", "airhockey-hit", "--n", "2", "--weight", "-1"], "weight of an objective"),
+        (["solve", "airhockey-hit", "--n", "2", "--tolerance", "2"], "--tolerance must be above 0 and below 1"),
+        (["solve", "airhockey-hit", "--n", "2", "--weight", "-1"], "--weight must not be negative"),
     ],
 )
 def test_bad_arguments_are_one_line_and_leave_nothing_behind(
