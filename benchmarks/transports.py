@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from common import arguments, progress, report, table
 from numpy.typing import NDArray
-from onthefly import Goals, measure, rows_of
+from onthefly import Goals, figures, refine_each, rows_of
 
 import cnpgen
 from cnpgen.make.boundary_problems import draw_boundary_problems
@@ -137,7 +137,8 @@ def main() -> None:
         planner = Planner(model)
         for name, boundary in problems.items():
             progress(f"{model}: {name}")
-            found = measure(planner, boundary, chosen.refined)
+            plans = planner.plan_batch(boundary)
+            found = figures(plans, refine_each(plans[: chosen.refined]))
             results.setdefault(model, {})[name] = found
             rows += rows_of(model, name, found, goals_of(name))
             if chosen.again:

@@ -32,6 +32,7 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 LONGEST_STEP = 0.01  # s: looks further apart miss most of what a robot does in between
+BESIDE = 1e-3  # in phase: how far apart looks on either side of a kink are
 _GLANCE = Phases(np.linspace(0, 1, 33))  # phases at which most plans that are not valid show it
 
 
@@ -154,8 +155,11 @@ class _Plan:
 
     @property
     def corners(self) -> frozenset[float]:
-        """Phases at which constraints change abruptly, and the knots, where derivatives of the motion do."""
-        kinks = (s for constraint in self.problem.constraint for s in constraint.kinks)
+        """Phases at which constraints change abruptly, two on either side, and the knots, where derivatives of motions do.
+
+        Second differences across a kink say nothing of what lies beside it.
+        """
+        kinks = (s + k * BESIDE for each in self.problem.constraint for s in each.kinks for k in range(-2, 3))
         return knots(self.motion.path.shape[1], self.motion.rate.shape[1], self.motion.degree).union(kinks)
 
     def is_finite(self) -> bool:
