@@ -155,7 +155,7 @@ class _Plan:
 
     @property
     def corners(self) -> frozenset[float]:
-        """Phases at which constraints change abruptly, two on either side, and the knots, where derivatives of motions do.
+        """Phases at which constraints change abruptly, two on either side of each, and the knots of both splines.
 
         Second differences across a kink say nothing of what lies beside it.
         """
