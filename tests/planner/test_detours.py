@@ -59,6 +59,7 @@ def test_of_lines_those_that_break_nothing_may_be_taken_or_else_the_one_that_bre
     np.testing.assert_array_equal(detours.worth(broken), [0, 2, 4, 8])
 
 
+@pytest.mark.slow  # it compiles for a minute
 @needs_compiler
 def test_other_lines_mend_plans_and_leave_those_that_break_nothing(model: Model, problems: Boundary) -> None:
     straight = Planner(replace(model, meaning=replace(model.meaning, middles=()))).plan_batch(problems)

@@ -19,6 +19,7 @@ def test_what_mends_most_of_what_is_left_is_chosen_next() -> None:
     assert middles._most_useful(mended, 1) == [1]
 
 
+@pytest.mark.slow  # it compiles for a minute
 @needs_compiler
 def test_other_lines_are_chosen_that_mend_plans_of_other_problems(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(middles, "TRIED", 40)
