@@ -78,6 +78,7 @@ def test_other_lines_mend_plans_and_leave_those_that_break_nothing(model: Model,
 
 
 @needs_compiler
+@pytest.mark.slow  # likewise
 def test_a_line_with_a_corner_passes_near_it_and_keeps_its_ends(model: Model, problems: Boundary) -> None:
     with surroundings(model.problem) as given:
         prepare = Planner(model)._kit.prepare
