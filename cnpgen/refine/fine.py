@@ -75,7 +75,6 @@ class FineCheck:
         self._bounds = BoundsTemplate(problem, world, self._grid.s, NONE)
         conditions = self._bounds.conditions
         self.equalities = {each.name for each in conditions if each.is_equality}
-        self._equal = np.repeat([each.is_equality for each in conditions], [len(each.g) for each in conditions])
         limits = np.repeat([each.exactness == "limit" for each in conditions], [len(each.g) for each in conditions])
         self._speeds = np.flatnonzero((self._bounds.needs == 1) & ~limits)  # what is bounded besides joint velocities
         self._powers = _powers_of_rate(problem, world, stage)[self._speeds] if len(self._speeds) else np.empty(0)
@@ -108,7 +107,7 @@ class FineCheck:
         """Return the bounds half way, with tolerances but for those of clearances of capsules."""
         bounds, middle, capsules = self._bounds.of(task.start_xyz), POINTS // 2, self._bounds.capsules
         allowed = np.where(capsules, 0.0, self._bounds.allowed)
-        equal = self._equal & (self._bounds.needs == 0)
+        equal = self._bounds.equal & (self._bounds.needs == 0)
         return AtRest(bounds.lower[middle] - allowed, bounds.upper[middle] + allowed, capsules, equal)
 
     def too_fast(self, task: Task, x: Array) -> float:
@@ -129,7 +128,7 @@ class FineCheck:
 
     def imprecision_of_ends(self, task: Task) -> float:
         """By how much the boundary conditions alone miss an equality, as a multiple of what is allowed."""
-        return float(np.fmax.reduce(self._excess_of_ends(task)[:, self._equal], axis=None, initial=0.0))
+        return float(np.fmax.reduce(self._excess_of_ends(task)[:, self._bounds.equal], axis=None, initial=0.0))
 
     def _excess_of_ends(self, task: Task) -> Array:
         bounds, motion = self._bounds.of(task.start_xyz), self.transcription(task)

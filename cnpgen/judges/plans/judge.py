@@ -19,7 +19,7 @@ from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
 from cnpgen.judges.plans.peaks import look_at_peaks
-from cnpgen.judges.plans.sampling import FEW_CELLS, LONGEST, Samples, few_phases, sample, time_table, times
+from cnpgen.judges.plans.sampling import CELLS, FEW_CELLS, LONGEST, Samples, few_phases, sample, time_table, times
 from cnpgen.judges.plans.survey import Survey, survey
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.obstacles import obstacle_tops
@@ -184,10 +184,13 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
 
 def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
-    found = _first_look(plan) if brief else _look(plan, step)
-    if isinstance(found, Verdict):
-        return found
-    states, samples, table = found
+    if fault := _fault(plan):
+        return Verdict(fault)
+    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=FEW_CELLS if brief else CELLS)
+    found = _first_look(plan, table) if brief else _look(plan, table, step)
+    if found is None:
+        return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
+    states, samples = found
     if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
     world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
@@ -219,7 +222,7 @@ def _margins(survey: Survey, *, brief: bool) -> list[Margin]:
 
 def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     """Whether the ends, or a constraint at one of a few phases, are wrong."""
-    if not plan.is_finite() or not plan.motion.runs_forward()[0]:
+    if _fault(plan):
         return True
     samples = Samples(_GLANCE.s, _GLANCE.s)
     states = course_at(plan.motion, _GLANCE, jerk=plan.problem.uses_jerk)
@@ -233,29 +236,20 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
 
 
-def _look(plan: _Plan, step: float) -> tuple[Course, Samples, Array] | Verdict:
-    """Choose where to look, look there, and tabulate the times; or say why there is nothing to look at."""
-    if fault := _fault(plan):
-        return Verdict(fault)
-    rate, degree = plan.motion.rate[0], plan.motion.degree
-    table = time_table(rate, degree)
+def _look(plan: _Plan, table: Array, step: float) -> tuple[Course, Samples] | None:
+    """Choose where to look, and look there; None where the motion is too long."""
     samples = sample(table, step, plan.spans, plan.corners)
-    if samples is None:
-        return _too_long(table)
-    return course(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples, table
+    return (course(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples) if samples else None
 
 
-def _first_look(plan: _Plan) -> tuple[Course, Samples, Array] | Verdict:
+def _first_look(plan: _Plan, table: Array) -> tuple[Course, Samples] | None:
     """Look at few phases, the same ones for every plan of a problem; see ``_look``."""
-    if fault := _fault(plan):
-        return Verdict(fault)
-    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=FEW_CELLS)
     if not table[1, -1] < LONGEST:
-        return _too_long(table)
+        return None
     phases, jerk = few_phases(plan.spans, plan.corners), plan.problem.uses_jerk
     exact = any(each.tolerance == 0 for each in plan.problem.constraint)  # then rounding decides: that of ``_look``
     states = course(plan.motion, phases.s, jerk=jerk) if exact else course_at(plan.motion, phases, jerk=jerk)
-    return states, Samples(phases.s, times(phases.s, table)), table
+    return states, Samples(phases.s, times(phases.s, table))
 
 
 def _fault(plan: _Plan) -> Reason | None:
@@ -263,10 +257,6 @@ def _fault(plan: _Plan) -> Reason | None:
     if not plan.is_finite():
         return Reason.NOT_FINITE
     return None if plan.motion.runs_forward()[0] else Reason.RATE
-
-
-def _too_long(table: Array) -> Verdict:
-    return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
 
 
 def reason_of(margins: list[Margin]) -> str:

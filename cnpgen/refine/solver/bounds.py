@@ -120,6 +120,7 @@ class BoundsTemplate:
         allowed: What the verdict allows residuals to exceed, in scaled units, shape (m,); ``UNTOLD`` of conditions that
             ask for more than is meant, of which the verdict knows nothing.
         needs: The highest derivative of q that each residual depends on, shape (m,).
+        equal: Which residuals are of equalities, shape (m,).
         capsules: Which residuals are clearances of the links' capsules, or of the paper's, shape (m,).
     """
 
@@ -141,9 +142,9 @@ class BoundsTemplate:
         widths = [len(each.g) for each in self.conditions]
         self.needs = np.repeat(needs, widths)
         self.capsules = np.repeat([isinstance(each, RobotClearance | SelfClearance) for each, _ in pairs], widths)
-        self._equal = np.repeat([each.is_equality for each in self.conditions], widths)
+        self.equal = np.repeat([each.is_equality for each in self.conditions], widths)
         with np.errstate(invalid="ignore"):
-            spare = np.where(self._equal, PRECISE, 1.0) * self.allowed + np.fmax(
+            spare = np.where(self.equal, PRECISE, 1.0) * self.allowed + np.fmax(
                 np.concatenate([high for _, high in loose], axis=1) - self._upper,
                 self._lower - np.concatenate([low for low, _ in loose], axis=1),
             )
@@ -193,7 +194,7 @@ class BoundsTemplate:
                 lower = np.asfortranarray(lower - np.minimum(below, self.allowed) * open_)
         with np.errstate(invalid="ignore"):
             wider = np.nan_to_num(np.fmax(upper - bounds.upper, bounds.lower - lower))
-        return Bounds(lower, upper, bounds.sharp, bounds.spare - np.where(self._equal, 0.0, wider))
+        return Bounds(lower, upper, bounds.sharp, bounds.spare - np.where(self.equal, 0.0, wider))
 
     def _of(self, start_tip: Array) -> Bounds:
         lower, upper = self._lower, self._upper

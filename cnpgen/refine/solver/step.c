@@ -295,7 +295,8 @@ static int objective(motion *s, const double *x, double proximal) {
 }
 
 /* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, or than
-`others` where no acceleration is in them and that is less, that may leap over it with a step of `step`, that were `missed`, or that had multipliers; `held` says which. */
+`others` where no acceleration is in them and that is less, that may leap over it with a step of `step`, that were
+`missed`, or that had multipliers; `held` says which. */
 void model(motion *s, const double *x, const double *g, double proximal, double near, double others, double step,
            const unsigned char *missed, const double *multipliers, unsigned char *held) {
   long nx = s->nx, points = s->grid.points, width = s->grid.orders * s->n + s->grid.orders - 1, m = s->m;
