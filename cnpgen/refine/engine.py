@@ -24,6 +24,7 @@ from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.task import Refined, Task
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.rest import is_finer
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -140,6 +141,9 @@ def load_refiner(
     if kernels is None:
         kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+    coarser = None
+    if spec is not None and is_finer(spec, problem.trajectory):
+        coarser = load_refiner(problem, robot, options=options, kernels=kernels, passes=passes)
     return Refiner(
         problem,
         robot,
@@ -149,4 +153,5 @@ def load_refiner(
         criterion=choose_criterion(problem, options.objective, options.weight),
         settings=settings,
         passes=passes,
+        coarser=coarser,
     )

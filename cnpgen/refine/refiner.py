@@ -23,6 +23,8 @@ from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT, Result, Settings, minimise
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Attempt, Outcome, Task
+from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.rest import with_fewer_knots, with_finer_knots
 from cnpgen.trajectory.spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -51,6 +53,7 @@ class Refiner:
         criterion: What is minimised beside the time, or None.
         settings: How to iterate.
         passes: Grids and tightening; ``default_passes`` by default.
+        coarser: A refiner for the problem's own control points, where plans have several spans for each of its spans.
     """
 
     def __init__(
@@ -64,8 +67,9 @@ class Refiner:
         criterion: Criterion | None = None,
         settings: Settings = DEFAULT,
         passes: Passes | None = None,
+        coarser: "Refiner | None" = None,
     ) -> None:
-        self.problem, self.robot, self.settings = problem, robot, settings
+        self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
         self.spec = problem.trajectory if spec is None else spec
         residuals = None if criterion is None else kernels.load(criterion_residuals, kind=criterion.kind)
         self.stage = ResidualKernels(
@@ -116,6 +120,8 @@ class Refiner:
         if self.settings.max_iterations == 0:
             yield self._slowed_only(task, given)
             return
+        if given is not None and self.coarser is not None:
+            yield from self._by_coarser(self.coarser, task, given)
         repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
         best = yield from self._passes(task, given, repaired)
         if self.check.refutes_ends(task):
@@ -132,6 +138,20 @@ class Refiner:
             yield from self._around(task, best)
         elif task.deadline is None and task.at_rest:
             yield from (self._along(task, start) for start in self._ways(task))
+
+    def _by_coarser(self, coarser: "Refiner", task: Task, given: Array) -> Iterator[Attempt]:
+        """Yield what the passes make of a plan with fewer control points, written with all of them.
+
+        With three times as many a step takes ten times as long, for motions that are 0.15 % faster.
+        """
+        own, fewer, degree = self.check.transcription(task), coarser.check.transcription(task), self.spec.degree
+        path, rate = own.unpack(given)
+        fitted = with_fewer_knots(Motion(path[None], rate[None], degree), task.boundary, coarser.spec)
+        start = coarser.given(replace(task, path=fitted.path[0], rate=fitted.rate[0]))
+        for attempt in () if start is None else coarser._passes(task, start, None):
+            path, rate = fewer.unpack(attempt.x)
+            same = with_finer_knots(Motion(path[None], rate[None], degree), self.spec)
+            yield replace(attempt, x=own.pack(same.path[0], same.rate[0]))
 
     def _restarted(
         self, task: Task, given: Array | None, line: Array, best: Attempt

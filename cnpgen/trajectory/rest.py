@@ -1,4 +1,4 @@
-"""What is left of motions after a moment, as motions of their own.
+"""What is left of motions after a moment, as motions of their own, with finer knots where that takes them.
 
 The rest of a spline is a spline, but not one whose knots are evenly spaced, as those of motions are. So it is written
 anew, by least squares, with exact ends and the same duration. Where few knots are left that is exact to rounding; where
@@ -53,6 +53,17 @@ def finer(spec: TrajectorySpec, spans: int) -> TrajectorySpec:
         spans * (points - spec.degree) + spec.degree for points in (spec.path_control_points, spec.rate_control_points)
     )
     return TrajectorySpec(degree=spec.degree, path_control_points=path, rate_control_points=rate)
+
+
+def is_finer(spec: TrajectorySpec, than: TrajectorySpec) -> bool:
+    """Whether a spec has two or three spans in the place of each of another one."""
+    return spec in {finer(than, spans) for spans in range(2, FINEST + 1)}
+
+
+def with_fewer_knots(motion: Motion, boundary: Boundary, spec: TrajectorySpec) -> Motion:
+    """Write motions with the control points of a coarser spec, by least squares, with exact ends and durations."""
+    left = motion.duration()
+    return _written(motion, np.zeros(len(left)), left, boundary, spec)
 
 
 def with_finer_knots(motion: Motion, spec: TrajectorySpec) -> Motion:
