@@ -43,7 +43,7 @@ LINE = 8  # numbers in a line of the cache
 class _Bases(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("orders", "points")),
-        *((name, c_void_p) for name in ("path", "rate", "path_at", "rate_at")),
+        *((name, c_void_p) for name in ("path", "rate", "path_at", "rate_at", "path_from", "rate_from")),
     )
 
 
@@ -52,7 +52,7 @@ class _Polyhedron(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("dim", "stride", "count")),
-        *((name, c_void_p) for name in ("rows", "low", "high", "norm", "scratch", "active")),
+        *((name, c_void_p) for name in ("rows", "low", "high", "norm", "scratch", "active", "begin")),
     )
 
 
@@ -60,7 +60,10 @@ class _Motion(ctypes.Structure):
     """``motion`` of step.c."""
 
     _fields_ = (
-        *((name, c_long) for name in ("n", "path", "rate", "fixed", "nx", "stride", "m", "gauss", "criteria", "thin")),
+        *(
+            (name, c_long)
+            for name in ("n", "path", "rate", "support", "fixed", "nx", "stride", "m", "gauss", "criteria", "thin")
+        ),
         *((name, _Bases) for name in ("grid", "nodes")),
         *((name, c_void_p) for name in ("values", "jacobian", "criterion")),
         *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
@@ -140,6 +143,7 @@ class CompiledSteps:
             n=motion.n,
             path=spec.path_control_points,
             rate=spec.rate_control_points,
+            support=motion.grid.bases.support,
             fixed=3 + motion.interior,
             nx=motion.nx,
             stride=stride,
@@ -208,7 +212,7 @@ class CompiledSteps:
         dim = self._nx + 1
         rows = dim + self._m * self._points + BLOCK
         scratch = (2 * dim + BLOCK) * stride + 8 * (stride + BLOCK)
-        sizes = (rows * dim, rows, rows, rows, scratch, dim)  # rows, low, high, norm, scratch, active
+        sizes = (rows * dim, rows, rows, rows, scratch, dim, rows // BLOCK + 1)  # as in _Polyhedron
         return _Polyhedron(dim, stride, 0, *self._room(sizes))
 
     def _room(self, sizes: Sequence[int]) -> list[int]:
@@ -222,10 +226,10 @@ class CompiledSteps:
 
     def _bases(self, bases: Bases) -> _Bases:
         orders, points, _ = bases.path.shape
-        arrays = (*bases.along, bases.path_at, bases.rate_at)
+        arrays = (*bases.along, bases.path_at, bases.rate_at, *bases.supported_from)
         return _Bases(orders, points, *map(self._keep, arrays))
 
-    def _keep(self, array: Array) -> int:
+    def _keep(self, array: NDArray[Any]) -> int:
         array = np.ascontiguousarray(array)
         self._kept.append(array)
         return address_of(array)

@@ -11,6 +11,7 @@ from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 NODES = 4  # Gauss nodes per cell of the time integral: wrong by less than 1e-9 of it
 CRITERION_NODES = 40
 BEGINNING = 1e-6  # a phase as good as 0, where jerks differ by some percent from those at the next point of a grid
@@ -24,18 +25,25 @@ class Bases:
         path: Basis of p and its derivatives, shape (orders, K, C).
         rate: Basis of r and its derivatives, shape (orders - 1, K, R).
         path_at: ``path`` phase by phase, shape (K, C, orders).
-        rate_at: ``rate`` phase by phase, shape (K, R, orders - 1).
+        rate_at: ``rate`` phase by phase, shape (K, orders - 1, R).
+        support: How many control points count at a phase: those whose basis functions are not 0 there.
     """
 
     path: Array
     rate: Array
     path_at: Array
     rate_at: Array
+    support: int
 
     @cached_property
     def along(self) -> tuple[Array, Array]:
         """``path`` and ``rate`` with the phases last, shape (orders, C, K) and (orders - 1, R, K)."""
         return np.ascontiguousarray(self.path.swapaxes(1, 2)), np.ascontiguousarray(self.rate.swapaxes(1, 2))
+
+    @cached_property
+    def supported_from(self) -> tuple[Indices, Indices]:
+        """First of the control points of p and of r that count at every phase, shape (K,) each."""
+        return _first(self.path, self.support), _first(self.rate, self.support)
 
     def states(self, path: Array, rate: Array) -> Array:
         """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K).
@@ -106,4 +114,11 @@ def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
 def _bases(spec: TrajectorySpec, s: Array, orders: int) -> Bases:
     path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
     rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]
-    return Bases(np.stack(path), np.stack(rate), np.stack(path, axis=-1), np.stack(rate, axis=-1))
+    arrays = np.stack(path), np.stack(rate), np.stack(path, axis=-1), np.stack(rate, axis=1)
+    return Bases(*arrays, support=spec.degree + 1)
+
+
+def _first(bases: Array, support: int) -> Indices:
+    """First control point that counts at every phase, shape (K,), so that none of the next ones is missing."""
+    found: Indices = np.minimum((bases != 0).any(axis=0).argmax(axis=1), bases.shape[2] - support)
+    return found

@@ -59,6 +59,7 @@ typedef struct {
   double *rows, *low, *high, *norm; /* blocks of B rows, (dim, B) each; of every row, norm: 1 over its length */
   double *scratch;                  /* (2 dim + B) stride and 8 (stride + B) */
   int *active;                      /* (dim,) */
+  long *begin;                      /* in every block: so many first numbers of its rows are 0 */
 } polyhedron;
 
 I double *entry(const polyhedron *p, long row, long i) { return p->rows + (row / B) * p->dim * B + i * B + row % B; }
@@ -79,9 +80,15 @@ typedef struct {
 
 /* Solve a a' share = product, the active rows', and return how much of the square of such a row they make up. */
 static double solved(working *s) {
-  long count = s->count, length = padded(count);
-  products(s->factor, s->stride, count, s->product, length, s->change);
-  combine(s->factor, s->stride, count, s->change, count, s->share);
+  long count = s->count, stride = s->stride, size;
+  for (long i = 0; i < count; i += B) { /* rows of the triangle end at the diagonal, columns begin there */
+    size = count - i < B ? count - i : B;
+    products(s->factor + i * stride, stride, size, s->product, padded(i + size), s->change + i);
+  }
+  for (long i = 0; i < count; i += B) {
+    size = count - i < B ? count - i : B;
+    combine(s->factor + i * stride + i, stride, count - i, s->change + i, size, s->share + i);
+  }
   return dot(s->change, s->change, count);
 }
 
@@ -162,7 +169,7 @@ static void survey(const polyhedron *p, working *set, const double *x, double fe
   for (long first = 0; first < p->count; first += B) {
     const double *block = entry(p, first, 0);
     v sums[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, 0, p->dim) EACH(l, 0, 4) sums[l] += x[i] * at(block + i * B + l * W);
+    EACH(i, p->begin[first / B], p->dim) EACH(l, 0, 4) sums[l] += x[i] * at(block + i * B + l * W);
     EACH(l, 0, 4) put(r + l * W, sums[l]);
     EACH(i, first, first + B < p->count ? first + B : p->count) {
       double by = excess(p, i, r[i - first]);
@@ -225,7 +232,7 @@ static int repair(const polyhedron *p, working *set, double *x, long which, doub
 static void measure(const polyhedron *p) {
   for (long first = 0; first < p->count; first += B) {
     v squares[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, 0, p->dim) EACH(l, 0, 4) { v x = at(entry(p, first, i) + l * W); squares[l] += x * x; }
+    EACH(i, p->begin[first / B], p->dim) EACH(l, 0, 4) { v x = at(entry(p, first, i) + l * W); squares[l] += x * x; }
     EACH(l, 0, 4) put(p->norm + first + l * W, K(1) / vsqrt(squares[l]));
   }
 }

@@ -8,14 +8,15 @@ joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. neares
 
 typedef void kernel(long, const double *const *, const long *, double *const *);
 
-typedef struct { /* a spline basis at some phases */
+typedef struct { /* a spline basis at some phases: three or four orders of the path */
   long orders, points;
-  const double *path, *rate;       /* (orders, C, points), (orders - 1, R, points) */
-  const double *path_at, *rate_at; /* (points, C, orders), (points, R, orders - 1) */
+  const double *path, *rate;         /* (orders, C, points), (orders - 1, R, points) */
+  const double *path_at, *rate_at;   /* (points, C, orders), (points, orders - 1, R) */
+  const long *path_from, *rate_from; /* the first of the `support` control points that count at a phase, (points,) */
 } bases;
 
 typedef struct {
-  long n, path, rate, fixed, nx, stride, m, gauss, criteria, thin; /* stride: of rows of nx + 1, see below */
+  long n, path, rate, support, fixed, nx, stride, m, gauss, criteria, thin; /* stride: of rows of nx + 1, see below */
   bases grid, nodes;
   kernel *values, *jacobian, *criterion;
   const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be missing */
@@ -89,31 +90,33 @@ static void gather(const motion *s, long orders, const double *jacobian, long co
   EACH(o, 0, orders - 1) J[orders * stride + o] = jacobian[((orders * n + o) * count + i) * points + k];
 }
 
-/* Gradient in the variables of a function whose gradient in w, at phase k, is J; `row` has room for W more. */
-static void chain(const motion *s, const bases *b, long k, const double *J, double *row) {
+I const double *rate_at(const motion *s, const bases *b, long k, long order) {
+  return b->rate_at + (k * (b->orders - 1) + order) * s->rate;
+}
+
+/* Gradient in the variables of a function whose gradient in w, at phase k, is J, padded with zeros, so that what is
+written behind a control point is 0; `row` has room for W more. */
+static void chain(const motion *s, const bases *b, long k, const double *J, double *restrict row) {
   long n = s->n, orders = b->orders, split = s->nx - s->rate, stride = padded(n);
-  const double *path = b->path_at + k * s->path * orders, *rate = b->rate_at + k * s->rate * (orders - 1);
-  double ends[6 * stride], *next = ends;
-  EACH(c, 0, s->path) {
-    int inside = c >= 3 && c < s->fixed;
-    double *control = inside ? row + (c - 3) * n : next;
-    if (!inside) next += stride;
+  long first = b->path_from[k], behind = first + s->support, from = b->rate_from[k];
+  double ends[6 * stride];
+  memset(row, 0, s->nx * sizeof(double));
+  EACH(c, first, behind) {
+    const double *path = b->path_at + (k * s->path + c) * orders;
+    double *control = c < 3 ? ends + c * stride : c < s->fixed ? row + (c - 3) * n : ends + (c - s->fixed + 3) * stride;
     for (long j = 0; j < n; j += W) {
-      v x = K(0);
-      EACH(o, 0, orders) x += path[c * orders + o] * at(J + o * stride + j);
-      put(control + j, x);
+      v x = path[0] * at(J + j) + path[1] * at(J + stride + j) + path[2] * at(J + 2 * stride + j);
+      put(control + j, orders > 3 ? x + path[3] * at(J + 3 * stride + j) : x);
     }
   }
-  EACH(i, 0, s->rate) {
-    double x = 0;
-    EACH(o, 0, orders - 1) x += rate[i * (orders - 1) + o] * J[orders * stride + o];
-    row[split + i] = x * s->rates[i];
-  }
+  EACH(o, 0, orders - 1) add(row + split + from, J[orders * stride + o], rate_at(s, b, k, o) + from, s->support);
+  EACH(i, from, from + s->support) row[split + i] *= s->rates[i];
   EACH(e, 0, s->slopes) {
     long c = s->point[e] < 3 ? s->point[e] : s->point[e] - s->fixed + 3;
-    double x = 0;
-    for (long j = 0; j < n; j += W) x += sum(at(ends + c * stride + j) * at(s->slope + e * stride + j));
-    row[split + s->variable[e]] += x * s->rates[s->variable[e]];
+    if (s->point[e] < first || s->point[e] >= behind) continue;
+    v x = K(0);
+    for (long j = 0; j < n; j += W) x += at(ends + c * stride + j) * at(s->slope + e * stride + j);
+    row[split + s->variable[e]] += sum(x) * s->rates[s->variable[e]];
   }
 }
 
@@ -152,7 +155,7 @@ static double criterion(motion *s, int derivatives) {
     cost += share * rho;
     if (!derivatives) continue;
     EACH(i, 0, s->rate)
-      s->gradient[nx - s->rate + i] -= share * rho / r * b->rate_at[(k * s->rate + i) * (b->orders - 1)] * s->rates[i];
+      s->gradient[nx - s->rate + i] -= share * rho / r * rate_at(s, b, k, 0)[i] * s->rates[i];
     EACH(i, 0, count) {
       gather(s, b->orders, jacobian, count, i, points, k, J);
       for (long j = 0; j < b->orders * padded(n) + b->orders - 1; j++) J[j] *= root;
@@ -256,14 +259,29 @@ static void whiten(const motion *s, double *block, long from) {
   }
 }
 
+static double largest(const double *a, long n) {
+  double found = -INFINITY, lanes[W];
+  v most = K(-INFINITY);
+  long i = 0;
+  for (; i + W <= n; i += W) most = vmax(most, at(a + i));
+  put(lanes, most);
+  for (; i < n; i++) found = a[i] > found ? a[i] : found;
+  EACH(l, 0, W) found = lanes[l] > found ? lanes[l] : found;
+  return found;
+}
+
+static int any(const unsigned char *a, const unsigned char *b, long n) {
+  int found = 0;
+  EACH(i, 0, n) found |= a[i] | b[i];
+  return found;
+}
+
 /* Mark crests along the motion, what is beside them, and the thin grid, where they are nearer than `near`. */
 static void crest(const motion *s, const double *excess, double near, unsigned char *wide) {
   long points = s->grid.points;
   unsigned char peak[points + 2];
-  double most = -INFINITY;
-  EACH(k, 0, points) most = excess[k] > most ? excess[k] : most;
   memset(wide, 0, points);
-  if (!(most > -near)) return;
+  if (!(largest(excess, points) > -near)) return;
   memset(peak, 1, points + 2);
   EACH(k, 1, points) peak[k + 1] = excess[k] >= excess[k - 1];
   EACH(k, 0, points - 1) peak[k + 1] &= excess[k] >= excess[k + 1];
@@ -277,7 +295,7 @@ static double leap(const motion *s, long k, const double *J, double step) {
   double reach = 0;
   EACH(o, 1, b->orders - 1) {
     double change = 0;
-    EACH(i, 0, s->rate) change += fabs(b->rate_at[(k * s->rate + i) * (b->orders - 1) + o]) * s->rates[i];
+    EACH(i, 0, s->rate) change += fabs(rate_at(s, b, k, o)[i]) * s->rates[i];
     reach += fabs(J[b->orders * padded(s->n) + o]) * change * step;
   }
   return reach;
@@ -292,6 +310,13 @@ static int objective(motion *s, const double *x, double proximal) {
   duration(s, x + s->nx - s->rate, 1);
   if (s->criterion) criterion(s, 1);
   return factor(s, proximal);
+}
+
+/* How many numbers of a row of the programme are certainly 0 before the first that may be another. */
+static long leading(const motion *s, long row) {
+  if (row <= s->nx) return row;
+  long zeros = (s->grid.path_from[s->where[row - s->nx - 1] % s->grid.points] - 3) * s->n, split = s->nx - s->rate;
+  return zeros < 0 ? 0 : zeros < split ? zeros : split;
 }
 
 /* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, or than
@@ -317,7 +342,7 @@ void model(motion *s, const double *x, const double *g, double proximal, double 
   for (long first = 0; first < points; first += TILE) {
     long tile = points - first < TILE ? points - first : TILE, ld[2] = {points, points};
     s->jacobian(tile, (const double *const[]){s->w + first, s->top + first}, ld, (double *const[]){values, jacobian});
-    EACH(t, 0, tile) EACH(i, 0, m) {
+    EACH(i, 0, m) if (any(held + i * points + first, s->sharp + i * points + first, tile)) EACH(t, 0, tile) {
       long k = first + t, number = i * points + k;
       if (!held[number] && !s->sharp[number]) continue;
       gather(s, s->grid.orders, jacobian, m, i, tile, t, J);
@@ -330,8 +355,15 @@ void model(motion *s, const double *x, const double *g, double proximal, double 
       count++;
     }
   }
-  for (long first = 0; first < count; first += B) whiten(s, entry(p, first, 0), first + B <= nx ? first : 0);
   s->held = count - nx - 1, p->count = count;
+  for (long block = 0; block * B < count; block++) {
+    p->begin[block] = nx;
+    EACH(row, block * B, (block + 1) * B < count ? (block + 1) * B : count) {
+      long begin = leading(s, row);
+      if (begin < p->begin[block]) p->begin[block] = begin;
+    }
+    whiten(s, entry(p, block * B, 0), p->begin[block]);
+  }
 }
 
 /* How far the rows may go, and what the elastic variable adds to them. */

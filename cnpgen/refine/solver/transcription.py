@@ -231,7 +231,7 @@ class Transcription:
         control = bases.path_at[k] @ stage[:, : orders * n].reshape(m, orders, n)
         out = np.empty((m, self.nx))
         out[:, : self.split] = control[:, 3 : self._fixed].reshape(m, self.split)
-        out[:, self.split :] = (bases.rate_at[k] @ stage[:, orders * n :, None])[..., 0] * rate
+        out[:, self.split :] = (stage[:, None, orders * n :] @ bases.rate_at[k])[:, 0] * rate
         for each in self._slopes(rate):
             out[:, self.split + each.variable] += control[:, each.point] @ (each.slope[0] * rate[each.variable])
         return out
