@@ -238,9 +238,16 @@ def _assembled(given: Plans, refined: list[Refined], options: RefineOptions) -> 
         refined_with=json.dumps({"cnpgen": __version__, **options.said()}),
         sealed=False,
     )
-    valid, screened = np.array([each.valid for each in refined]), screen(plans)
-    status = np.where(valid, PlanStatus.VALID, np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened))
-    return Refinement(given, replace(plans, status=status.astype(np.uint8)), tuple(refined))
+    status = _status(plans, np.array([each.valid for each in refined]))
+    return Refinement(given, replace(plans, status=status), tuple(refined))
+
+
+def _status(plans: Plans, valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    status = np.full(len(plans), PlanStatus.VALID, np.uint8)
+    if not valid.all():
+        screened = screen(plans[~valid])
+        status[~valid] = np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened)
+    return status
 
 
 def _columns(refined: list[Refined]) -> Mapping[str, Array]:
