@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from cnpgen.kernels.cache import make_private, one_at_a_time
-from cnpgen.kernels.compiled import find_compiler
+from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
 from cnpgen.make.dataset import make_dataset
 from cnpgen.make.load import load_dataset_recipe
@@ -198,11 +198,11 @@ def columns_of(folder: Path, split: str = "train") -> dict[str, np.ndarray]:
 @pytest.fixture
 def fresh_compiler() -> Iterator[None]:
     """Forget which compiler was found, before and after the test."""
-    from cnpgen.kernels import compiled
+    from cnpgen.kernels import compiler
 
     def forget() -> None:
-        compiled.find_compiler.cache_clear()
-        compiled.compiler_version.cache_clear()
+        compiler.find_compiler.cache_clear()
+        compiler.compiler_version.cache_clear()
 
     forget()
     yield

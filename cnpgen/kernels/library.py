@@ -29,8 +29,8 @@ from cnpgen.kernels.compiled import (
     CompiledKernel,
     compile_source,
     compile_tape,
-    require_compiler,
 )
+from cnpgen.kernels.compiler import require_compiler
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel

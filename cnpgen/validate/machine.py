@@ -236,7 +236,7 @@ def _hdf5_version() -> str:
 
 
 def _compiler() -> str:
-    from cnpgen.kernels.compiled import compiler_version, find_compiler
+    from cnpgen.kernels.compiler import compiler_version, find_compiler
 
     path = find_compiler()
     return f"{path}, {compiler_version(path)}" if path else ""

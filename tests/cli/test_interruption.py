@@ -18,7 +18,7 @@ import cnpgen
 import cnpgen.__main__
 from cnpgen.cli.interruption import INTERRUPTED, Terminated, exit_code, interruptible, raise_if_interrupted
 from cnpgen.cli.main import main
-from cnpgen.kernels.compiled import find_compiler
+from cnpgen.kernels.compiler import find_compiler
 from tests.conftest import HANGING, some
 from tests.machine.test_workers import alive
 

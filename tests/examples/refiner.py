@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.judges.plans import Verdict, judge
-from cnpgen.kernels.compiled import find_compiler
+from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
 from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.problems.problem import Problem

@@ -9,8 +9,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cnpgen.kernels import compiled as compiled_module
-from cnpgen.kernels.compiled import CompiledGridKernel, compile_tape, find_compiler
+from cnpgen.kernels import compiler
+from cnpgen.kernels.compiled import CompiledGridKernel, compile_tape
+from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.emit import emit
 from cnpgen.kernels.grid import GridKernel
 from cnpgen.kernels.interpreted import BLOCK, InterpretedGridKernel
@@ -283,7 +284,7 @@ def test_minima_and_maxima_with_a_number_ignore_a_nan_though_they_are_one_instru
 def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
     mixed, tmp_path, monkeypatch, dtype, march, needs
 ):
-    monkeypatch.setattr(compiled_module, "vector_flags", lambda: (f"-march={march}",))
+    monkeypatch.setattr(compiler, "vector_flags", lambda: (f"-march={march}",))
     tape = tape_from_function(mixed, grid=GRID, dtype=dtype)
     path = compile_tape(tape, tmp_path)
     if needs and needs not in machine_flags():

@@ -18,10 +18,11 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels import compiled as compiled_module
+from cnpgen.kernels import compiled, compiler
 from cnpgen.kernels import library as library_module
 from cnpgen.kernels.cache import make_private, one_at_a_time
-from cnpgen.kernels.compiled import CompiledKernel, compile_tape, find_compiler, vector_flags
+from cnpgen.kernels.compiled import CompiledKernel, compile_tape
+from cnpgen.kernels.compiler import find_compiler, vector_flags
 from cnpgen.kernels.emit import emit
 from cnpgen.kernels.interpreted import BLOCK, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
@@ -422,7 +423,7 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
 ):
     from cnpgen.pipelines.stages import ik, motion
 
-    monkeypatch.setattr(compiled_module, "vector_flags", lambda: (f"-march={march}",))
+    monkeypatch.setattr(compiler, "vector_flags", lambda: (f"-march={march}",))
     library = prepare("airhockey-replan").context.kernels
     reference = replace(library, backend="numpy")
     random = np.random.default_rng(8)
@@ -448,11 +449,11 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
 
 
 @needs_compiler
-@pytest.mark.skipif(not compiled_module.shutil.which("aarch64-linux-gnu-gcc"), reason="no cross compiler for aarch64")
+@pytest.mark.skipif(not compiler.shutil.which("aarch64-linux-gnu-gcc"), reason="no cross compiler for aarch64")
 def test_the_emitted_c_compiles_for_aarch64(operations, tmp_path):
     source = tmp_path / "operations.c"
     source.write_text(emit(tape_from_function(operations)))
-    command = ["aarch64-linux-gnu-gcc", *compiled_module.FLAGS, str(source), "-o", str(tmp_path / "k.so"), "-lm"]
+    command = ["aarch64-linux-gnu-gcc", *compiler.FLAGS, str(source), "-o", str(tmp_path / "k.so"), "-lm"]
     subprocess.run(command, check=True)
 
 
@@ -574,13 +575,13 @@ def test_a_library_without_a_kernel_is_a_machine_error(root, tmp_path):
 def compilers(monkeypatch) -> list[Path]:
     """What the compiler is run for."""
     sources: list[Path] = []
-    real = compiled_module._run_compiler
+    real = compiled.run_compiler
 
     def run(compiler: str, level: str, source: Path, built: Path) -> None:
         sources.append(source)
         real(compiler, level, source, built)
 
-    monkeypatch.setattr(compiled_module, "_run_compiler", run)
+    monkeypatch.setattr(compiled, "run_compiler", run)
     return sources
 
 
@@ -598,7 +599,7 @@ def test_a_library_is_compiled_once_however_many_processes_want_it_at_once(root,
 @needs_compiler
 def test_a_process_that_was_stopped_while_it_compiled_is_not_waited_for_for_ever(root, tmp_path, monkeypatch):
     tape = tape_from_function(root, ROOT)
-    lock = tmp_path / "lib" / f".{compiled_module.library_stem(tape, find_compiler())}.lock"
+    lock = tmp_path / "lib" / f".{compiled.library_stem(tape, find_compiler())}.lock"
     make_private(lock.parent)
     monkeypatch.setattr("cnpgen.kernels.cache.PATIENCE", 0.1)
     with one_at_a_time(lock):
@@ -683,7 +684,7 @@ def test_a_compiler_that_hangs_is_ended_with_all_that_it_has_started(own_cache, 
     hanging.write_text(f"#!/bin/sh\nsleep 1000 &\necho $! > {tmp_path}/child\nwait\n")
     hanging.chmod(0o755)
     monkeypatch.setenv("CC", str(hanging))
-    monkeypatch.setattr(compiled_module, "VERSION_SECONDS", 0.5)
+    monkeypatch.setattr(compiler, "VERSION_SECONDS", 0.5)
     begun = time.monotonic()
     with pytest.raises(MachineError, match=r"cc took more than 0\.5 s to say its version"):
         choose_backend("compiled")
@@ -703,7 +704,7 @@ def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, 
     path.parent.mkdir(exist_ok=True)
     path.write_text(f'#!/bin/sh\nprintf "%s|" "$@" >> "{tmp_path}/seen"\nexec {find_compiler()} "$@"\n')
     path.chmod(0o755)
-    compiled_module.find_compiler.cache_clear()
+    compiler.find_compiler.cache_clear()
     monkeypatch.setenv("CC", command.format(cc=path))
     assert chosen_with_warnings() == ("compiled", own_cache, [])
     seen = (tmp_path / "seen").read_text()
@@ -714,7 +715,7 @@ def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, 
 @needs_compiler
 def test_options_of_the_compiler_are_part_of_what_a_library_is_cached_under(root, own_cache):
     tape = tape_from_function(root, ROOT)
-    stems = {compiled_module.library_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
+    stems = {compiled.library_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
     assert len(stems) == 3
 
 

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cnpgen.kernels.compiled import find_compiler
+from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import default_cache_folder, problem_kernels
 from cnpgen.refine.fine import FineCheck
 from cnpgen.refine.jury import Jury

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.doctor_command import machine_text
-from cnpgen.kernels.compiled import find_compiler
+from cnpgen.kernels.compiler import find_compiler
 from cnpgen.machine import threads
 from cnpgen.validate import machine
 from cnpgen.validate.machine import check_machine, vector_instructions
