@@ -569,3 +569,20 @@ def test_first_steps_from_a_plan_hold_accelerations_that_are_far_from_their_limi
         results = [each.minimise(one, given, each.given(one)) for one in tasks_of(plans)]
         steps.append(sum(result.iterations for result in results))
     assert steps[1] < 0.95 * steps[0]
+
+
+@needs_compiler
+def test_rests_of_plans_of_hundredths_of_a_second_land_in_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of a ten thousandth of a radian breaks the limits of such a motion by its square."""
+    plans = Planner("airhockey-replan").plan_batch(draw_boundary_problems("airhockey-replan", 12, seed=61).boundary)
+    time = plans.duration - np.linspace(0.04, 0.1, len(plans))
+    goal = {"goal_q": plans.boundary.goal_q, "goal_dq": plans.boundary.goal_dq}
+    rests = Planner("airhockey-replan").replan(plans, time, **goal)
+    np.testing.assert_allclose(rests.duration, plans.duration - time)
+    steps = {}
+    for heavier in (1.0, sqp.HEAVIER):
+        monkeypatch.setattr(sqp, "HEAVIER", heavier)
+        found = refine_plans(rests, workers=1)
+        assert found.valid.all()
+        steps[heavier] = sum(each.iterations for each in found.refined)
+    assert steps[sqp.HEAVIER] < 0.7 * steps[1.0]
