@@ -57,7 +57,7 @@ def measure(name: str, rows: int, seed: int) -> dict[str, dict[str, float]]:
 
 def rows_of(name: str, found: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
     """Lay out what was found."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for what in found[NOTHING]:
         one, other = (found[way][what] for way in (NOTHING, PLANNER))
         goal = MINUTES.get(name) if what.startswith("minutes") else None

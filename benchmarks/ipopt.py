@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cnpgen.refine.passes import Pass
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.sqp import Result, Settings
 from cnpgen.refine.solver.transcription import Linearisation, Transcription
 from cnpgen.refine.task import Task
@@ -47,7 +48,8 @@ SMALL = 1e-2  # values below this are taken for this
 def with_ipopt(refiner: Refiner) -> Refiner:
     """Return a refiner whose passes are run by Ipopt, with all else as it is: starts, passes, bounds and verdicts."""
 
-    def minimise(task: Task, which: Pass, x: Array) -> Result:
+    def minimise(task: Task, which: Pass, x: Array, hulls: Hulls | None = None) -> Result:
+        assert hulls is None, "Ipopt keeps capsules clear, not hulls"
         motion = refiner.transcription(task, which)
         bounds = refiner.bounds(task, which, motion.end_residuals())
         return minimise_with_ipopt(motion, bounds, x, which.settings)
@@ -248,7 +250,7 @@ class Programme:
         """Wrap a NumPy function of vectors of nonzeros as a CasADi function; ``slope`` is its wrapped Jacobian."""
         raised = self.raised
 
-        class Wrapped(ca.Callback):  # type: ignore[misc]
+        class Wrapped(ca.Callback):
             def __init__(self) -> None:
                 ca.Callback.__init__(self)
                 self.construct(name, {})
@@ -274,7 +276,7 @@ class Programme:
             def get_jacobian(self, *_: Any) -> Any:
                 return slope
 
-            def eval(self, arguments: list[Any]) -> list[Any]:
+            def eval(self, arguments: Any) -> list[Any]:
                 try:
                     return [ca.DM(output, compute(*(np.array(each.nonzeros()) for each in arguments)))]
                 except BaseException as error:

@@ -74,8 +74,8 @@ class Problems:
     time: NDArray[np.float64] | None = None
 
     def __getitem__(self, rows: NDArray[np.int64]) -> "Problems":
-        parts = (None if each is None else each[rows] for each in (self.executed, self.time))
-        return Problems(self.boundary[rows], *parts)
+        executed = None if self.executed is None else self.executed[rows]
+        return Problems(self.boundary[rows], executed, None if self.time is None else self.time[rows])
 
 
 def first_motions(count: int, seed: int) -> Plans:
@@ -202,7 +202,7 @@ def goals_of(name: str) -> Goals:
 
 def rows_of(model: str, name: str, found: dict[str, float], goals: Goals) -> list[tuple[str, ...]]:
     """Lay out what was found of a set, each figure beside its goal."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for what, value in found.items():
         goal, at_most = goals.get(what.removeprefix("replan, "), (None, False))
         rows.append((model, name, what, f"{value:,.4g}", *verdict(value, goal, at_most=at_most)))
@@ -230,8 +230,8 @@ def main() -> None:
         for name, each in problems.items():
             progress(f"{model}: {name}")
             results.setdefault(model, {})[name] = measure(planner, each, chosen.refined)
-    each = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
-    rows = [row for model, name, found in each for row in rows_of(model, name, found, goals_of(name))]
+    every = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
+    rows = [row for model, name, found in every for row in rows_of(model, name, found, goals_of(name))]
     head = ("planner", "problems", "figure", "value", "goal", "")
     report({"onthefly": results}, [table("planning on the fly", head, rows, left=3)], as_json=chosen.json)
 

@@ -157,13 +157,14 @@ class Boxes:
     """The obstacles, the arm's capsules and the held object as Coal shapes."""
 
     def __init__(self, problem: Problem, arm: Arm) -> None:
-        self.arm, self.problem = arm, problem
+        self.arm = arm
         radius = next(c.radius for c in problem.constraint if isinstance(c, RobotClearance))
         depth = next(c.depth for c in problem.constraint if isinstance(c, ObjectContact))
         lengths = [np.linalg.norm(b - a) for a, b in self._segments(arm.robot.base)]
         self.capsules = [coal.Capsule(radius, float(length)) for length in lengths]
         self.held = coal.Box(*(np.array(problem.object.size) - 2 * depth)) if problem.object else None
-        self.boxes = [coal.Box(o.x.high - o.x.low, o.y.high - o.y.low, 10.0) for o in problem.obstacle]
+        self.tables = [(o.x, o.y) for o in problem.obstacle if o.x and o.y]
+        self.boxes = [coal.Box(x.high - x.low, y.high - y.low, 10.0) for x, y in self.tables]
 
     def _segments(self, q: Array) -> list[tuple[Array, Array]]:
         tip = self.arm.position(q)
@@ -181,8 +182,8 @@ class Boxes:
         if self.held is not None:
             pose = self.arm.data.oMf[self.arm.tip]
             moving.append((self.held, coal.Transform3s(pose.rotation, pose.translation)))
-        for obstacle, box, top in zip(self.problem.obstacle, self.boxes, tops, strict=True):
-            middle = [(obstacle.x.low + obstacle.x.high) / 2, (obstacle.y.low + obstacle.y.high) / 2, top - 5.0]
+        for (x, y), box, top in zip(self.tables, self.boxes, tops, strict=True):
+            middle = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - 5.0]
             place = coal.Transform3s(np.eye(3), np.array(middle))
             if any(coal.collide(s, pose, box, place, request, coal.CollisionResult()) for s, pose in moving):
                 return True

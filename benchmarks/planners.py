@@ -188,10 +188,10 @@ def measure(name: str, seed: int, sizes: dict[str, int]) -> dict[str, float]:
 
 
 def rows_of(name: str, found: dict[str, float]) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for what, value in found.items():
         target = TARGETS.get(name, {}).get(what)
-        cells = verdict(value, target and target.value, at_most=bool(target and target.at_most))
+        cells = verdict(value, target.value if target else None, at_most=bool(target and target.at_most))
         ratio = f"{value / target.value:.3f}" if target else ""
         rows.append((name, what, f"{value:,.4g}", *cells, ratio))
     return rows

@@ -61,8 +61,8 @@ def strikes(planner: Planner, repeat: int) -> dict[str, Any]:
             clock.append(time.process_time())
             for what, seconds in zip(times, np.diff(clock).tolist(), strict=True):
                 times[what].append(seconds)
-        for what, seconds in times.items():
-            found[f"{size} {what}"] = 1e3 * median(seconds) / size
+        for what, each in times.items():
+            found[f"{size} {what}"] = 1e3 * median(each) / size
     struck = planner.strike(states, pucks, TARGET)
     found |= {"answered": len(struck.plans) / BATCH, "valid": float(evaluate_plans(struck.plans).valid.mean())}
     return found
@@ -118,7 +118,7 @@ def deadlines(given: Plans) -> list[dict[str, Any]]:
 
 def rows_of(name: str, found: dict[str, Any]) -> list[tuple[str, ...]]:
     """Lay out what strikes of a planner take."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for size in (1, BATCH):
         for what in ("completed", "planned", "both"):
             value = found[f"{size} {what}"]

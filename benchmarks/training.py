@@ -26,7 +26,8 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.kit import surroundings
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.requests import read_rows, record_of
+from cnpgen.planner.requests import read_rows
+from cnpgen.problems.record import as_record
 from cnpgen.refine.plans import refine_plans
 from cnpgen.training import step as parts
 from cnpgen.training.data import open_training_data
@@ -39,12 +40,12 @@ NETWORKS = ((128, 64), (256, 128), (512, 128), (2048, 128))  # width and batch; 
 TARGETS = {(256, 128): 12.0, (512, 128): 35.0, (2048, 128): 700.0}  # ms
 NAMES = {"forward": "forward", "control_points": "omega", "pull_back": "omega", "backward": "backward"}
 SHOWN = ("forward", "backward", "loss", "landing", "omega", "rest")
-REACHED = {  # in this CPU time, from scratch: (figure, bound, whether it is an upper one)
-    "airhockey-hit": (
-        120.0, ("paper_valid", 0.999, False), ("valid", 0.9, False), ("z_error_mm_s", 0.2, True),
-        ("duration_over_refined", 1.02, True),
-    ),
-    "heavy-object": (300.0, ("paper_valid", 0.985, False), ("valid", 0.9, False)),
+REACHED = {  # in this CPU time [s], from scratch: figure -> bound, and whether it is an upper one
+    "airhockey-hit": (120.0, {
+        "paper_valid": (0.999, False), "valid": (0.9, False), "z_error_mm_s": (0.2, True),
+        "duration_over_refined": (1.02, True),
+    }),
+    "heavy-object": (300.0, {"paper_valid": (0.985, False), "valid": (0.9, False)}),
 }  # fmt: skip
 REFINED = 200  # plans that are refined to see how far their times are from the optimum
 
@@ -76,7 +77,7 @@ def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: st
     """Time steps of one network: milliseconds, and the share of every part."""
     settings = TrainingSettings(hidden=hidden, batch_size=batch)
     source, clock, times = open_training_data(folder), Clock({}), []
-    with one_thread(), surroundings(record_of(source.dataset.blueprint), backend) as given:
+    with one_thread(), surroundings(as_record(source.dataset.problem), backend) as given:
         run, _ = prepare_run(source, given, settings, check_rows=1)
         state = begin_run(run, Length(steps=10**6))
         gradient = np.empty_like(state.adam.parameters)
@@ -152,8 +153,8 @@ def learn(name: str, seconds: float, rows: int, seed: int, folder: Path) -> tupl
         "duration_over_refined": float(ratio),
         "refined_valid": float(good.mean()),
     }
-    usual, *targets = REACHED.get(name, (seconds,))
-    bounds = {key: (bound, upper) for key, bound, upper in targets} if seconds <= usual else {}
+    usual, targets = REACHED.get(name, (seconds, {}))
+    bounds = targets if seconds <= usual else {}
     cells = []
     for key, value in facts.items():
         bound, upper = bounds.get(key, (None, False))

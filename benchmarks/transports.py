@@ -142,10 +142,10 @@ def main() -> None:
             results.setdefault(model, {})[name] = found
             rows += rows_of(model, name, found, goals_of(name))
             if chosen.again:
-                found["again"] = refined_again(planner, boundary[: chosen.again])
-                twice += [(model, name, how, *map(str, each.values())) for how, each in found["again"].items()]
-    head = ("planner", "problems", "figure", "value", "goal", "")
-    tables = [table("transports", head, rows, left=3)]
+                again = refined_again(planner, boundary[: chosen.again])
+                results[model][name] = {**found, "again": again}
+                twice += [(model, name, how, *map(str, each.values())) for how, each in again.items()]
+    tables = [table("transports", ("planner", "problems", "figure", "value", "goal", ""), rows, left=3)]
     if twice:
         head = ("planner", "problems", "plans", "valid", "later", "2 % shorter by refining again", "than any other")
         tables.append(table(f"{chosen.again} of them refined again", head, twice, left=3))

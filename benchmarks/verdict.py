@@ -79,7 +79,8 @@ def state_by_state(plans: Plans) -> tuple[list[dict[str, float]], float]:
         states = course(motion, moments.s)
         severity: dict[str, float] = {}
         for k, phase in enumerate(moments.s):
-            world.set_state(*(values[:, k].copy() for values in (states.q, states.dq, states.ddq)), tops[index])
+            q, dq, ddq = (values[:, k].copy() for values in (states.q, states.dq, states.ddq))
+            world.set_state(q, dq, ddq, tops[index])
             for constraint in problem.constraint:
                 for condition in constraint.measured(world):
                     wider = constraint.funnel(condition, np.array([phase]), plans.columns["start_xyz"][index])
@@ -185,9 +186,9 @@ def main() -> None:
     content = {"verdict": [vars(item) for item in found]}
     if options.always:
         steps = [always(load_plans(file), options.always, options.seed) for file in options.file]
-        rows = [(item.problem, str(item.plans), str(item.differ)) for item in steps]
+        differ = [(item.problem, str(item.plans), str(item.differ)) for item in steps]
         title = f"plans at a tolerance, judged every {', '.join(f'{1e6 * step:g}' for step in STEPS)} us"
-        tables.append(table(title, ("problem", "plans", "differ from step to step"), rows))
+        tables.append(table(title, ("problem", "plans", "differ from step to step"), differ))
         content["always"] = [vars(item) for item in steps]
     report(content, tables, as_json=options.json)
 
