@@ -31,7 +31,7 @@ LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
 LEAP = 1.5  # the next step may be longer than the last one by this factor
 NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # see ``Settings.near``
 LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
-HEAVIER, HEAVIEST, HALF = 10.0, 1e4, 0.5  # times as much, at most, after a step that left more than that of a violation
+BRIEF = 0.2  # s: it grows with the cube of how much shorter a motion is, in which a small step changes much
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 HEAVY = 3.0  # times the objective is what violations weigh where repairing them would not pay
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
@@ -164,7 +164,6 @@ class _Descent:
         self._multipliers: Array | None = None
         self._settled = self._creeps = False  # the second: along its limits, which it does not come to meet
         self._missed = np.zeros(self._g.shape, bool)  # residuals that a rejected step broke unseen
-        self._weight = LANDING
 
     def result(self, iterations: int) -> Result:
         """Return where the iteration is."""
@@ -173,19 +172,16 @@ class _Descent:
     def advance(self) -> None:
         """Try a step: take it, or know better for the next one."""
         settings, self.tightened = self._settings, False
-        lands = self._settled or self._creeps
-        proximal = SHORTEST if self.landing else self._weight if lands else settings.proximal
+        landing = LANDING * max(BRIEF / self.cost, 1.0) ** 3
+        proximal = SHORTEST if self.landing else landing if self._settled or self._creeps else settings.proximal
         near = next(near for length, near in settings.near if self._length > length)
         where = Near(self.violation, near, LEAP * self._length, self._missed, self._multipliers)
         model = self._steps.model(self.x, self._g, where, proximal=proximal, penalty=self._penalty)
         step = self._propose(model)
-        x, violation = self.x, self.violation
         if step is None:
             self._radius *= 0.25
         else:
             self._try(step, model.held)
-        if lands and self.x is not x and self.violation > max(HALF * violation, settings.violation_tolerance):
-            self._weight = min(HEAVIER * self._weight, HEAVIEST)
         if self.x is not self._start:
             self._violations.append(self.violation)
         if self._is_stuck() and self._penalty < self.cost:  # breaking its limits may pay: it will not
