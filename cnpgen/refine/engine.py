@@ -111,10 +111,11 @@ def _jury(record: ProblemRecord, degree: int, _thread: int) -> Jury:
     return Jury(*open_problem(record), degree=degree)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions) -> Refiner:
     problem, robot = open_problem(record)
-    return load_refiner(problem, robot, spec=spec, options=options)
+    coarser = _refiner(record, problem.trajectory, options) if is_finer(spec, problem.trajectory) else None
+    return load_refiner(problem, robot, spec=spec, options=options, coarser=coarser)
 
 
 def load_refiner(
@@ -125,6 +126,7 @@ def load_refiner(
     options: RefineOptions = DEFAULT,
     kernels: KernelLibrary | None = None,
     passes: Passes | None = None,
+    coarser: Refiner | None = None,
 ) -> Refiner:
     """Build the refiner of a problem.
 
@@ -135,15 +137,13 @@ def load_refiner(
         options: How to refine.
         kernels: Where kernels are loaded from; by default the fastest that this machine can run.
         passes: Grids and tightening; the usual ones by default.
+        coarser: A refiner for the problem's own control points, where ``spec`` has several spans for each of theirs.
     """
     from cnpgen.world.state import World
 
     if kernels is None:
         kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
-    coarser = None
-    if spec is not None and is_finer(spec, problem.trajectory):
-        coarser = load_refiner(problem, robot, options=options, kernels=kernels, passes=passes)
     return Refiner(
         problem,
         robot,

@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cnpgen.refine.engine import load_refiner
+from cnpgen.plans.plans import make_plans
+from cnpgen.refine.engine import prepare
 from cnpgen.refine.jury import Jury
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import Attempt, Outcome, Refined, Task
@@ -15,7 +17,7 @@ from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.rest import finer, with_fewer_knots, with_finer_knots
 from cnpgen.trajectory.spec import TrajectorySpec
 from tests.examples.plans import Plan, load
-from tests.examples.refiner import library, task
+from tests.examples.refiner import task
 
 
 def slower(plan: Plan, spec: TrajectorySpec) -> Task:
@@ -31,7 +33,10 @@ def refined(plan: Plan, tool: Refiner, asked: Task) -> Refined:
 
 
 def tool_of(plan: Plan, spec: TrajectorySpec) -> Refiner:
-    return load_refiner(plan.problem, plan.robot, spec=spec, kernels=library(plan.problem.name))
+    """The refiner that ``refine_plans`` takes for plans with so many control points."""
+    path, rate = np.zeros((1, spec.path_control_points, plan.robot.n)), np.ones((1, spec.rate_control_points))
+    plans = make_plans(plan.problem, plan.boundary, path_control_points=path, rate_control_points=rate)
+    return prepare(plans, RefineOptions())
 
 
 @pytest.mark.parametrize("spans", [2, 3])
