@@ -62,11 +62,8 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
     """
     import casadi as ca
 
-    orders = problem.path_orders
-    names = (*(f"p{order}" for order in range(orders)), "rates", "tops")
-    widths = (*[robot.n] * orders, orders - 1, count_numbers(problem.obstacle))
-    columns, (p, *path, rate, tops) = zip(*map(symbols, names, widths), strict=True)
-    (p1, p2), (r, r1) = path[:2], rate[:2]
+    columns, (p, *path, rate, tops) = _on_path(robot, problem)
+    orders, (p1, p2), (r, r1) = problem.path_orders, path[:2], rate[:2]
     dq = [slope * r for slope in p1]
     ddq = [(curve * r + slope * r1) * r for curve, slope in zip(p2, p1, strict=True)]
     moving = tuple(ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders))
@@ -79,6 +76,53 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
                 out += [value - float(high)] if np.isfinite(high) else []
     worst = reduce(ca.fmax, out) if out else ca.SX(-1)
     return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
+
+
+def speed_coefficients(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(the column of speed_excess) -> rest, square, mixed`` of what bounds rates on a given path.
+
+    Values of ``speed_residuals`` that are squares of dq, or linear in ddq, are ``rest + square r^2 + mixed r r'``. Of
+    those that are proportional to dq the square of the largest share of a bound is, which stands for all, as the last
+    row. Bounds are those of ``coefficient_bounds``.
+    """
+    import casadi as ca
+
+    columns, values, still = _on_path(robot, problem)[0], speed_residuals(robot, problem), ca.SX.zeros(robot.n)
+    p, p1, p2, _, tops = columns
+    rest, fast, rising = (values(p, *moving, tops) for moving in ((still, still), (p1, p2), (still, p1)))
+    proportional, *bounds = proportional_rows(robot, problem), *speed_bounds(robot, problem)[:2]
+    shares = [
+        fast[row] * float(1 / bound[row])
+        for row in np.flatnonzero(proportional).tolist()
+        for bound in bounds
+        if np.isfinite(bound[row])
+    ]
+    others, last = np.flatnonzero(~proportional).tolist(), [ca.SX.zeros(1)] if shares else []
+    found = [ca.vertcat(each[others], *last) for each in (rest, fast - rest, rising - rest)]
+    if shares:
+        found[1][-1] = reduce(ca.fmax, shares, ca.SX(0)) ** 2
+    return ca.Function("speed_coefficients", [ca.vertcat(*columns)], ca.cse([ca.densify(each) for each in found]))
+
+
+def coefficient_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array]:
+    """Lower and upper bounds of the rows of ``speed_coefficients``."""
+    lower, upper, _ = speed_bounds(robot, problem)
+    proportional = proportional_rows(robot, problem)
+    shares = [1.0] if proportional.any() else []
+    return np.append(lower[~proportional], -np.inf * np.array(shares)), np.append(upper[~proportional], shares)
+
+
+def proportional_rows(robot: "Robot", problem: Problem) -> NDArray[np.bool_]:
+    """Which rows of ``speed_residuals`` are proportional to dq, between bounds of either sign, shape (m,)."""
+    import casadi as ca
+
+    state, tops = _moving(problem, symbols("q", robot.n)[1]), symbols("tops", count_numbers(problem.obstacle))[1]
+    dq, found = state.moving[0], []
+    for condition, needs in _conditions(robot, problem, state, tops):
+        for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True) if needs else ():
+            linear = needs == 1 and ca.is_linear(value, dq) and ca.substitute(value, dq, ca.SX.zeros(robot.n)).is_zero()
+            found.append(linear and low < 0 < high)
+    return np.array(found, bool)
 
 
 def rest_excess(robot: "Robot", problem: Problem) -> Any:
@@ -112,6 +156,15 @@ def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array, NDArra
         np.concatenate([condition.upper for condition, _ in found] or [np.empty(0)]),
         np.array([cubic for condition, cubic in found for _ in condition.g], bool),
     )
+
+
+def _on_path(robot: "Robot", problem: Problem) -> tuple[list[Any], list[Vec]]:
+    """Name p, p', p'', ..., r, r', ... and tops, as SX columns and as lists of their scalars."""
+    orders = problem.path_orders
+    names = (*(f"p{order}" for order in range(orders)), "rates", "tops")
+    widths = (*[robot.n] * orders, orders - 1, count_numbers(problem.obstacle))
+    columns, scalars = zip(*map(symbols, names, widths), strict=True)
+    return list(columns), list(scalars)
 
 
 @dataclass(frozen=True)

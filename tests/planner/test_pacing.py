@@ -118,15 +118,15 @@ def test_the_smallest_root_is_that_of_numpy():
 
 
 def test_rates_go_on_to_the_first_bound():
-    """One row, one motion, two phases: g = r + r r', upper bound 3, from r = 1 and r' = 0 along (1, 1)."""
-    rest, linear, square, mixed = (np.full((1, 1, 2), each) for each in (0.0, 1.0, 0.0, 1.0))
+    """One row, one motion, two phases: g = r^2 + r r', upper bound 1.8, from r = 1 and r' = 0 along (1, 0.2)."""
+    coefficients = [np.full((1, 1, 2), each) for each in (0.0, 1.0, 1.0)]
     rates, along = np.stack([np.ones((1, 2)), np.zeros((1, 2))]), np.array([[[1.0, 0.2]], [[1.0, 0.2]]])
-    bounds = np.array([-np.inf]), np.array([1.6])
-    found = advance([rest, linear, square, mixed], bounds, rates, along)[0]
-    assert (1 + found) * (1 + found) == pytest.approx(1.6)
-    assert advance([rest, linear, square, mixed], (bounds[0], np.array([9.0])), rates, along)[0] == MOST
-    back = advance([rest, linear, square, mixed], (bounds[0], np.array([0.9])), rates, along[:, :, :1].repeat(2, 2))[0]
-    assert (1 + back) ** 2 == pytest.approx(0.9)
+    bounds = np.array([-np.inf]), np.array([1.8])
+    found = advance(coefficients, bounds, rates, along)[0]
+    assert (1 + found) * (1 + found) + (1 + found) * found == pytest.approx(1.8)
+    assert advance(coefficients, (bounds[0], np.array([9.0])), rates, along)[0] == MOST
+    back = advance(coefficients, (bounds[0], np.array([0.9])), rates, along[:, :, :1].repeat(2, 2))[0]
+    assert (1 + back) * (1 + back) + (1 + back) * back == pytest.approx(0.9)
 
 
 def test_plans_whose_jerk_is_bounded_are_not_paced(given):
