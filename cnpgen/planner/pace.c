@@ -10,10 +10,11 @@ typedef void kernel(long n, const double *const *in, const long *distances, doub
 
 typedef struct {
   long joints, tops, path_points, points;  /* numbers of them; control points of p and of r */
-  long phases, rows, first, last, sweeps;  /* phases: of vectors that are full; control points that may move */
+  long phases, rows, first, last, moves;   /* phases: of vectors that are full; control points that may move; moves */
   const double *path, *rate;               /* basis of p, p', p'', and of r, r', (orders, control points, phases) */
   const double *lower, *upper;             /* (rows,) */
-  const long *span;                        /* phases that a control point counts at, (points, 2) */
+  const long *order;                       /* control points of r, one move after the other */
+  const long *path_span, *span;            /* phases that a control point counts at, (control points, 2) */
   kernel *coefficients, *excess;           /* of the column that lay_out makes */
   double share, most, least, slack;
 } pacing;
@@ -27,10 +28,10 @@ typedef struct {
   double *critical;        /* (rows, W) */
 } room;
 
-/* The smallest x > 0 with q x^2 + l x = room; infinite if there is none. */
-static double smallest(double room, double l, double q) {
-  double inner = l * l + 4 * q * room, below = l + sqrt(inner);
-  return inner >= 0 && below > 0 ? 2 * room / below : INFINITY;
+/* The smallest x > 0 with q x^2 + l x = room; infinite where there is none. */
+I v smallest(v room, v l, v q) {
+  v below = l + vsqrt(l * l + 4 * q * room);
+  return pick(below > 0, 2 * room / below, K(INFINITY));
 }
 
 I double largest(v x) {
@@ -59,49 +60,44 @@ I quadratic along(direction d, const double *a, long size) {
     square * d.square[2] + mixed * d.mixed[2]};
 }
 
-/* How far one value may go, or has to go back. */
-typedef struct { double up, back; int out; } limits;
+/* How far values may go and have to go back, lane by lane, and which are out. */
+typedef struct { v up, back; vi out; } limits;
 
-I limits met(limits so_far, double room, double l, double q) {
-  double up = so_far.up;
-  if (room < 0) {
-    if (l == 0 && q == 0) return so_far;
-    double x = smallest(-room, l, -q);
-    so_far.out = 1;
-    if (x < INFINITY && -x < so_far.back) so_far.back = -x;
-  } else if (up * ((l > 0 ? l : 0) + up * (q > 0 ? q : 0)) > room) {
-    double x = smallest(room, l, q);
-    if (x < up) so_far.up = x;
-  }
-  return so_far;
+I limits met(limits found, v room, v l, v q) {
+  vi broken = room < 0;
+  v way = smallest(vabs(room), l, pick(broken, -q, q));
+  found.up = lesser(pick(broken, K(INFINITY), way), found.up);
+  found.back = larger(pick(broken & (way < INFINITY), way, K(0)), found.back);
+  found.out |= broken & ((l != 0) | (q != 0));
+  return found;
 }
 
 /* How far r may go along b, or has to go back: what `advance` of pacing.py gives, for one motion. */
 static double advance(const pacing *p, const room *m, long from, long to) {
   const double *restrict lower = p->lower, *restrict upper = p->upper, *restrict coefficients = m->coefficients;
-  double *restrict critical = m->critical;
-  long rows = p->rows, phases = p->phases, size = rows * phases;
-  limits found = {p->most, 0, 0};
-  EACH(i, 0, (to - from) / W) { /* from the middle outwards: what is far from it hardly ever matters then */
-    long k = from + ((to - from) / W / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * W;
+  double *restrict critical = m->critical, up = p->most;
+  long rows = p->rows, phases = p->phases, size = rows * phases, steps = (to - from) / W;
+  limits found = {K(up), K(0), K(0) != K(0)};
+  EACH(i, 0, steps) { /* from the middle outwards: what is far from it hardly ever matters then */
+    long k = from + (steps / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * W;
     direction d = direction_at(m, k);
-    v worst = K(-1), up = K(found.up);
+    v worst = K(-1);
     EACH(row, 0, rows) { /* by how much a bound may be broken at `up` */
       quadratic f = along(d, coefficients + row * phases + k, size);
       v over = larger(f.g - upper[row], lower[row] - f.g) + up * (vabs(f.l) + up * vabs(f.q));
       put(critical + row * W, over);
       worst = larger(over, worst);
     }
-    if (largest(worst) > 0) EACH(row, 0, rows) {
-      if (!(largest(at(critical + row * W)) > 0)) continue;
+    if (!(largest(worst) > 0)) continue;
+    EACH(row, 0, rows) if (largest(at(critical + row * W)) > 0) {
       quadratic f = along(d, coefficients + row * phases + k, size);
-      EACH(l, 0, W) if (critical[row * W + l] > 0) {
-        found = met(found, upper[row] - f.g[l], f.l[l], f.q[l]);
-        found = met(found, f.g[l] - lower[row], -f.l[l], -f.q[l]);
-      }
+      found = met(met(found, upper[row] - f.g, f.l, f.q), f.g - lower[row], -f.l, -f.q);
     }
+    up = -largest(-found.up);
   }
-  return !found.out ? found.up : found.back > p->least ? found.back : p->least;
+  if (!(largest(flag(found.out)) > 0)) return up;
+  double back = -largest(found.back);
+  return back > p->least ? back : p->least;
 }
 
 static void add(double *out, double x, const double *b, long from, long to) {
@@ -109,20 +105,22 @@ static void add(double *out, double x, const double *b, long from, long to) {
 }
 
 /* out = c[first] basis[first] + ...; `apart` lies between control points. */
-static void combine(const pacing *p, const double *basis, const double *c, long apart, long first, long last, double *out) {
-  EACH(k, 0, p->phases) out[k] = 0;
-  EACH(j, first, last) add(out, c[j * apart], basis + j * p->phases, 0, p->phases);
+static void combine(const double *basis, const long *span, long phases, const double *c, long apart, long first, long last,
+                    double *out) {
+  EACH(k, 0, phases) out[k] = 0;
+  EACH(j, first, last) add(out, c[j * apart], basis + j * phases, span[2 * j], span[2 * j + 1]);
 }
 
 static void combine_rates(const pacing *p, const double *c, long first, long last, double *r, double *r1) {
-  combine(p, p->rate, c, 1, first, last, r);
-  combine(p, p->rate + p->points * p->phases, c, 1, first, last, r1);
+  combine(p->rate, p->span, p->phases, c, 1, first, last, r);
+  combine(p->rate + p->points * p->phases, p->span, p->phases, c, 1, first, last, r1);
 }
 
 static void lay_out(const pacing *p, const double *path, const double *tops, const room *m) {
   EACH(order, 0, 3) EACH(i, 0, p->joints) {
     const double *basis = p->path + order * p->path_points * p->phases;
-    combine(p, basis, path + i, p->joints, 0, p->path_points, m->column + (order * p->joints + i) * p->phases);
+    double *out = m->column + (order * p->joints + i) * p->phases;
+    combine(basis, p->path_span, p->phases, path + i, p->joints, 0, p->path_points, out);
   }
   EACH(i, 0, p->tops) EACH(k, 0, p->phases) m->r1[(1 + i) * p->phases + k] = tops[i];
 }
@@ -145,7 +143,8 @@ static void pace_one(const pacing *p, double *c, const room *m) {
   long size = p->rows * p->phases;
   run(p->coefficients, p, m, (double *const[]){a, a + size, a + 2 * size});
   combine_rates(p, c, 0, p->points, r, r1);
-  EACH(sweep, 0, p->sweeps) EACH(j, p->first, p->last) {
+  EACH(move, 0, p->moves) {
+    long j = p->order[move];
     const double *basis = p->rate + j * p->phases, *slope = basis + p->points * p->phases;
     long from = p->span[2 * j], to = p->span[2 * j + 1];
     for (long k = from; k < to; k += W) put(b + k, c[j] * at(basis + k)), put(b1 + k, c[j] * at(slope + k));
@@ -162,6 +161,7 @@ static void pace_one(const pacing *p, double *c, const room *m) {
 /* Change the rates of motions, (count, points). */
 void pace(const pacing *p, long count, const double *path, const double *tops, double *rate, double *memory) {
   long phases = p->phases, numbers = 3 * p->joints;
+  memory += -((size_t)memory / sizeof(double)) % W;
   room m = {.column = memory, .r = memory + numbers * phases};
   m.r1 = m.r + phases, m.coefficients = m.r1 + (1 + p->tops) * phases;
   m.b = m.coefficients + 3 * p->rows * phases, m.b1 = m.b + phases, m.over = m.b1 + phases;

@@ -3,9 +3,9 @@
 The path stays, and so do the two control points of the rate at either end, which the boundary conditions hang on. On a
 path that is given, what a problem bounds is ``g = rest + square r^2 + mixed r r'`` with coefficients that depend on the
 phase alone: squares of velocities, accelerations and torques are, as in time-optimal path parameterisation (Bobrow,
-Dubowsky and Gibson, 1985). So it is a quadratic of any one control point of the rate, or of a factor of them
-all, and how far that may go before the first bound is met follows in closed form. Control points go half of that way,
-one after the other and twice; what is then left, all of them go together.
+Dubowsky and Gibson, 1985). So it is a quadratic of any one control point of the rate, or of a factor of them all, and
+how far that may go before the first bound is met follows in closed form. Control points go three quarters of that way,
+every second one first and then those between; what is then left, all of them go together.
 """
 
 import ctypes
@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 SOURCE = Path(__file__).with_name("pace.c")
 INTERVALS = 79  # between phases, of which there are as many as fill vectors of any machine
 FIXED = 2  # control points of the rate at either end
-SWEEPS, SHARE = 2, 0.5
-MOST, LEAST = 0.5, -0.3  # of itself: no control point is changed more at once
+SHARE = 0.75  # of the way that a control point has to the first bound
+MOST, LEAST = 1.0, -0.3  # of itself: no control point is changed more at once
 ROUNDED = 1e-9  # of a limit: what a boundary condition may be beyond it
 VECTOR = 8  # numbers, at most
 
@@ -46,8 +46,9 @@ class _Pacing(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("joints", "tops", "path_points", "points")),
-        *((name, c_long) for name in ("phases", "rows", "first", "last", "sweeps")),
-        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "span", "coefficients", "excess")),
+        *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
+        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "order", "path_span", "span")),
+        *((name, c_void_p) for name in ("coefficients", "excess")),
         *((name, c_double) for name in ("share", "most", "least", "slack")),
     )
 
@@ -108,31 +109,23 @@ class Pacing(Speeds):
         return 10 * ROUNDED * float(bounds[np.isfinite(bounds)].max(initial=0.0))
 
     @cached_property
-    def _span(self) -> NDArray[np.int64]:
-        """First phase at which a control point of the rate counts, and that behind the last, shape (R, 2)."""
-        counts = (self.rate != 0).any(axis=0)
-        first, last = counts.argmax(axis=0), len(counts) - counts[::-1].argmax(axis=0)
-        return np.stack([first - first % VECTOR, last + -last % VECTOR], axis=1).astype(np.int64)
-
-    @cached_property
     def _prepared(self) -> tuple[_Pacing, list[NDArray[Any]]]:
         """What pace.c knows of the problem, and the arrays that it looks into."""
-        bases = [aligned(each.size).reshape(each.swapaxes(1, 2).shape) for each in (self.path, self.rate)]
-        for base, table in zip(bases, (self.path, self.rate), strict=True):
-            base[:] = table.swapaxes(1, 2)
-        arrays = [*bases, *self._bounds, self._span]
-        tops = self.coefficients.tape.inputs[0] - 3 * self.joints - 2
+        order, lower, upper = order_of(self.rate.shape[2]), *self._bounds
+        arrays = [by_point(self.path), by_point(self.rate), lower, upper, order, span_of(self.path), span_of(self.rate)]
         (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
-        counts = (self.joints, tops, path_points, points, phases, len(self.lower), FIXED, points - FIXED, SWEEPS)
+        counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
+        moves = phases, len(lower), FIXED, points - FIXED, len(order)
         where = *map(address_of, arrays), self.coefficients.address, self.excess.address
-        return _Pacing(*counts, *where, SHARE, MOST, LEAST, self._slack), arrays
+        return _Pacing(*counts, *moves, *where, SHARE, MOST, LEAST, self._slack), arrays
 
     def _pace_compiled(self, path: Array, tops: Array, rate: Array) -> None:
         assert self.library is not None
         rows, phases = self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3, self.path.shape[1]
-        memory = aligned(rows * phases + VECTOR * len(self.lower) + rate.shape[1])
-        arrays = np.ascontiguousarray(path, np.float64), np.ascontiguousarray(tops, np.float64), rate, memory
-        self.library.pace(ctypes.byref(self._prepared[0]), len(rate), *map(address_of, arrays))
+        memory = np.empty(VECTOR + rows * phases + VECTOR * len(self.lower) + rate.shape[1])
+        given = [np.ascontiguousarray(each, np.float64) if each.size else None for each in (path, tops)]
+        where = (None if each is None else address_of(each) for each in (*given, rate, memory))
+        self.library.pace(ctypes.byref(self._prepared[0]), len(rate), *where)
 
 
 def make_pacing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Pacing:
@@ -155,11 +148,32 @@ def make_pacing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Pac
     return Pacing(speeds.excess, speeds.path, speeds.rate, *rows, joints=robot.n, library=library)
 
 
-def aligned(count: int) -> Array:
-    """Return an array of so many numbers that begins where a vector may."""
-    array = np.empty(count + VECTOR)
-    first = -address_of(array) // array.itemsize % VECTOR
-    return array[first : first + count]
+def span_of(table: Array) -> NDArray[np.int64]:
+    """First phase at which a control point counts, and that behind the last, as whole vectors.
+
+    Args:
+        table: Basis of a spline and its derivatives, shape (orders, K, points).
+
+    Returns:
+        Shape (points, 2).
+    """
+    counts = (table != 0).any(axis=0)
+    first, last = counts.argmax(axis=0), len(counts) - counts[::-1].argmax(axis=0)
+    return np.stack([first - first % VECTOR, last + -last % VECTOR], axis=1).astype(np.int64)
+
+
+def by_point(table: Array) -> Array:
+    """Lay out a basis as pace.c takes it, shape (orders, points, K), from where a vector may begin."""
+    found = np.empty(table.size + VECTOR)
+    found = found[-address_of(found) // found.itemsize % VECTOR :][: table.size]
+    found.reshape(table.swapaxes(1, 2).shape)[:] = table.swapaxes(1, 2)
+    return found
+
+
+def order_of(points: int) -> NDArray[np.int64]:
+    """In which order control points of the rate move: every second one, then those between."""
+    movable = np.arange(FIXED, points - FIXED)
+    return np.concatenate([movable[1::2], movable[::2]])
 
 
 def pace(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array) -> None:
@@ -173,7 +187,7 @@ def pace(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], ta
     """
     shaped = [each.reshape(len(each), len(rate), -1) for each in coefficients]
     movable = slice(FIXED, rate.shape[1] - FIXED)
-    for point in [*range(rate.shape[1])[movable]] * SWEEPS:
+    for point in order_of(rate.shape[1]):
         along = rate[:, point, None] * table[:, None, :, point]
         x = advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)
         rate[:, point] *= 1 + np.where(x > 0, SHARE * x, x)

@@ -94,8 +94,8 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
         robot: Its robot.
         kernels: Where kernels are loaded from.
     """
-    speeds = load_speeds(problem, kernels, INTERVALS)
-    return Slowing(speeds.excess, speeds.path, speeds.rate, kernels.load(speed_residuals), *speed_bounds(robot, problem))
+    speeds, residuals = load_speeds(problem, kernels, INTERVALS), kernels.load(speed_residuals)
+    return Slowing(speeds.excess, speeds.path, speeds.rate, residuals, *speed_bounds(robot, problem))
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:

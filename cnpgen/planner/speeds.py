@@ -1,7 +1,6 @@
 """What bounds how fast the paths of one problem may be run: how far they are out at K phases."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
