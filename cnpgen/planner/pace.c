@@ -13,10 +13,11 @@ typedef struct {
   long phases, rows, first, last, moves;   /* phases: of vectors that are full; control points that may move; moves */
   const double *path, *rate;               /* basis of p, p', p'', and of r, r', (orders, control points, phases) */
   const double *lower, *upper;             /* (rows,) */
-  const long *order;                       /* control points of r, one move after the other */
   const long *path_span, *span;            /* phases that a control point counts at, (control points, 2) */
+  const long *order;                       /* control points of r, one move after the other */
+  const double *shares;                    /* that they go of their ways up */
   kernel *coefficients, *excess;           /* of the column that lay_out makes */
-  double share, most, least, slack;
+  double most, least, slack;               /* of a control point, up and back; excess that is none */
 } pacing;
 
 /* What a motion is paced with, in memory of its own; K is the number of phases. */
@@ -149,7 +150,7 @@ static void pace_one(const pacing *p, double *c, const room *m) {
     long from = p->span[2 * j], to = p->span[2 * j + 1];
     for (long k = from; k < to; k += W) put(b + k, c[j] * at(basis + k)), put(b1 + k, c[j] * at(slope + k));
     double x = advance(p, m, from, to);
-    if (x > 0) x *= p->share;
+    if (x > 0) x *= p->shares[move];
     add(r, x, b, from, to), add(r1, x, b1, from, to);
     c[j] += x * c[j];
   }

@@ -4,8 +4,8 @@ The path stays, and so do the two control points of the rate at either end, whic
 path that is given, what a problem bounds is ``g = rest + square r^2 + mixed r r'`` with coefficients that depend on the
 phase alone: squares of velocities, accelerations and torques are, as in time-optimal path parameterisation (Bobrow,
 Dubowsky and Gibson, 1985). So it is a quadratic of any one control point of the rate, or of a factor of them all, and
-how far that may go before the first bound is met follows in closed form. Control points go three quarters of that way,
-every second one first and then those between; what is then left, all of them go together.
+how far that may go before the first bound is met follows in closed form. Every second control point goes a part of that
+way, one after the other, then those between a larger one of theirs; what is then left, all of them go together.
 """
 
 import ctypes
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 SOURCE = Path(__file__).with_name("pace.c")
 INTERVALS = 79  # between phases, of which there are as many as fill vectors of any machine
 FIXED = 2  # control points of the rate at either end
-SHARE = 0.75  # of the way that a control point has to the first bound
+SHARES = 0.65, 0.9  # of the way to the first bound: of every second control point, then of those between
 MOST, LEAST = 1.0, -0.3  # of itself: no control point is changed more at once
 ROUNDED = 1e-9  # of a limit: what a boundary condition may be beyond it
 VECTOR = 8  # numbers, at most
@@ -47,9 +47,9 @@ class _Pacing(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("joints", "tops", "path_points", "points")),
         *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
-        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "order", "path_span", "span")),
+        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "path_span", "span", "order", "shares")),
         *((name, c_void_p) for name in ("coefficients", "excess")),
-        *((name, c_double) for name in ("share", "most", "least", "slack")),
+        *((name, c_double) for name in ("most", "least", "slack")),
     )
 
 
@@ -111,13 +111,14 @@ class Pacing(Speeds):
     @cached_property
     def _prepared(self) -> tuple[_Pacing, list[NDArray[Any]]]:
         """What pace.c knows of the problem, and the arrays that it looks into."""
-        order, lower, upper = order_of(self.rate.shape[2]), *self._bounds
-        arrays = [by_point(self.path), by_point(self.rate), lower, upper, order, span_of(self.path), span_of(self.rate)]
+        lower, upper, order, shares = *self._bounds, *moves_of(self.rate.shape[2])
+        tables, spans = [[of(self.path), of(self.rate)] for of in (by_point, span_of)]
+        arrays = [*tables, lower, upper, *spans, order, shares]
         (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
         counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
         moves = phases, len(lower), FIXED, points - FIXED, len(order)
         where = *map(address_of, arrays), self.coefficients.address, self.excess.address
-        return _Pacing(*counts, *moves, *where, SHARE, MOST, LEAST, self._slack), arrays
+        return _Pacing(*counts, *moves, *where, MOST, LEAST, self._slack), arrays
 
     def _pace_compiled(self, path: Array, tops: Array, rate: Array) -> None:
         assert self.library is not None
@@ -170,10 +171,11 @@ def by_point(table: Array) -> Array:
     return found
 
 
-def order_of(points: int) -> NDArray[np.int64]:
-    """In which order control points of the rate move: every second one, then those between."""
+def moves_of(points: int) -> tuple[NDArray[np.int64], Array]:
+    """In which order control points of the rate move, and which share of their ways they go."""
     movable = np.arange(FIXED, points - FIXED)
-    return np.concatenate([movable[1::2], movable[::2]])
+    first, then = movable[1::2], movable[::2]
+    return np.concatenate([first, then]), np.repeat(SHARES, [len(first), len(then)])
 
 
 def pace(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array) -> None:
@@ -187,10 +189,10 @@ def pace(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], ta
     """
     shaped = [each.reshape(len(each), len(rate), -1) for each in coefficients]
     movable = slice(FIXED, rate.shape[1] - FIXED)
-    for point in order_of(rate.shape[1]):
+    for point, share in zip(*moves_of(rate.shape[1]), strict=True):
         along = rate[:, point, None] * table[:, None, :, point]
         x = advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)
-        rate[:, point] *= 1 + np.where(x > 0, SHARE * x, x)
+        rate[:, point] *= 1 + np.where(x > 0, share * x, x)
     along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
     rate[:, movable] *= 1 + advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)[:, None]
 
