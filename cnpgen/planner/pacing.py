@@ -22,7 +22,7 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled import address_of
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import coefficient_bounds, speed_coefficients
+from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
 from cnpgen.planner.speeds import BLOCK, Speeds, load_speeds
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
@@ -145,7 +145,7 @@ def make_pacing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Pac
     library, speeds = kernels.load_source(SOURCE), load_speeds(problem, kernels, INTERVALS)
     if library is not None:
         library.pace.argtypes, library.pace.restype = (c_void_p, c_long, *[c_void_p] * 4), None
-    rows = kernels.load(speed_coefficients), *coefficient_bounds(robot, problem)
+    rows = kernels.load(speed_coefficients), *coefficient_bounds(speed_bounds(robot, problem))
     return Pacing(speeds.excess, speeds.path, speeds.rate, *rows, joints=robot.n, library=library)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import speed_bounds, speed_residuals
+from cnpgen.planner.expressions import SpeedBounds, speed_bounds, speed_residuals
 from cnpgen.planner.speeds import BLOCK, Speeds, load_speeds
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
@@ -35,15 +35,11 @@ class Slowing(Speeds):
 
     Attributes:
         residuals: Kernel of ``expressions.speed_residuals``.
-        lower: Lower bounds of its values, shape (m,).
-        upper: Upper bounds, shape (m,).
-        cubic: Which of the values depend on the jerk, shape (m,).
+        bounds: Those of its values.
     """
 
     residuals: Kernel
-    lower: Array
-    upper: Array
-    cubic: NDArray[np.bool_]
+    bounds: SpeedBounds
 
     def factor(self, motion: Motion, tops: Array) -> Array:
         """Smallest factor, at least 1, by which each of N motions from rest to rest must be slower.
@@ -79,9 +75,10 @@ class Slowing(Speeds):
         )
         quadratic = 2 * (fast - 2 * slow + rest)  # c, from g(1) = rest + b + c and g(2) = rest + b / 2 + c / 4
         linear = fast - rest - quadratic
-        above, below = self.upper[:, None] - rest, rest - self.lower[:, None]
+        above, below = self.bounds.upper[:, None] - rest, rest - self.bounds.lower[:, None]
         needed = np.maximum(_smallest(above, linear, quadratic), _smallest(below, -linear, -quadratic))
-        change, cubic = (fast - rest)[self.cubic], self.cubic
+        cubic = self.bounds.cubic
+        change = (fast - rest)[cubic]
         needed[cubic] = np.maximum(_smallest_cubic(above[cubic], change), _smallest_cubic(below[cubic], -change))
         return np.asarray(needed.max(axis=0, initial=1.0))
 
@@ -95,7 +92,7 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
         kernels: Where kernels are loaded from.
     """
     speeds, residuals = load_speeds(problem, kernels, INTERVALS), kernels.load(speed_residuals)
-    return Slowing(speeds.excess, speeds.path, speeds.rate, residuals, *speed_bounds(robot, problem))
+    return Slowing(speeds.excess, speeds.path, speeds.rate, residuals, speed_bounds(robot, problem))
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:

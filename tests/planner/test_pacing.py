@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.planner.expressions import coefficient_bounds, proportional_rows
+from cnpgen.planner.expressions import coefficient_bounds, speed_bounds
 from cnpgen.planner.pacing import MOST, Pacing, advance, make_pacing, smallest
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
@@ -158,9 +158,9 @@ def test_coefficients_are_those_of_accelerations_torques_and_squared_shares_of_v
 def test_a_bound_of_something_else_than_a_velocity_keeps_a_row_of_its_own(given):
     """The square of the tip's speed is none that is proportional to velocities, and has no lower bound."""
     problem = replace(given.problem, constraint=(*given.problem.constraint, TipSpeed(highest=0.5)))
-    rows = proportional_rows(given.robot, problem)
-    assert rows.tolist() == [True] * 6 + [False] * 13
-    lower, upper = coefficient_bounds(given.robot, problem)
+    bounds = speed_bounds(given.robot, problem)
+    assert bounds.proportional.tolist() == [True] * 6 + [False] * 13
+    lower, upper = coefficient_bounds(bounds)
     assert (lower[-2:].tolist(), upper[-2:].tolist()) == ([-np.inf, -np.inf], [0.25, 1.0])
 
 

@@ -142,7 +142,7 @@ def test_the_look_at_all_phases_finds_the_motions_that_need_to_be_slower_and_no_
         states = slower.at(chebyshev(INTERVALS))
         lanes = [np.ascontiguousarray(part.reshape(-1, 7).T) for part in (states.q, states.dq, states.ddq)]
         (values,) = slowing.residuals(*lanes, np.repeat(tops.T, states.q.shape[1], axis=1))
-        out = np.maximum(values - slowing.upper[:, None], slowing.lower[:, None] - values).max(axis=0)
+        out = np.maximum(values - slowing.bounds.upper[:, None], slowing.bounds.lower[:, None] - values).max(axis=0)
         (excess,) = slowing.excess(slowing.column(slower, tops))
         np.testing.assert_allclose(excess[0], out, atol=1e-9)
         np.testing.assert_array_equal(slowing.factor(slower, tops) > 1, out.reshape(12, -1).max(axis=1) > 0)
@@ -161,7 +161,7 @@ def test_slowed_motions_keep_limited_jerks_and_slightly_faster_ones_do_not(fast,
     _, _, _, motion, tops = fast
     problem, robot = jerky("heavy-object", 2.0)
     slowing = make_slowing(problem, robot, problem_kernels(problem, robot, "numpy", tmp_path))
-    assert slowing.cubic.tolist() == [False] * (len(slowing.cubic) - 7) + [True] * 7
+    assert slowing.bounds.cubic.tolist() == [False] * (len(slowing.bounds.cubic) - 7) + [True] * 7
     factor = slowing.factor(motion, tops)
     needed = (factor > 1.01) & (factor < SLOWEST)
 
