@@ -32,7 +32,7 @@ typedef struct {
 /* The smallest x > 0 with q x^2 + l x = room; infinite where there is none. */
 I v smallest(v room, v l, v q) {
   v below = l + vsqrt(l * l + 4 * q * room);
-  return pick(below > 0, 2 * room / below, K(INFINITY));
+  return pick(below > K(0), 2 * room / below, K(INFINITY));
 }
 
 I double largest(v x) {
@@ -65,11 +65,11 @@ I quadratic along(direction d, const double *a, long size) {
 typedef struct { v up, back; vi out; } limits;
 
 I limits met(limits found, v room, v l, v q) {
-  vi broken = room < 0;
+  vi broken = room < K(0);
   v way = smallest(vabs(room), l, pick(broken, -q, q));
   found.up = lesser(pick(broken, K(INFINITY), way), found.up);
-  found.back = larger(pick(broken & (way < INFINITY), way, K(0)), found.back);
-  found.out |= broken & ((l != 0) | (q != 0));
+  found.back = larger(pick(broken & (way < K(INFINITY)), way, K(0)), found.back);
+  found.out |= broken & ((l != K(0)) | (q != K(0)));
   return found;
 }
 
