@@ -75,7 +75,7 @@ class Pacing(Speeds):
         """Return N motions along the same paths, between the same ends, whose rates meet the limits.
 
         One whose worst value is then further out than before stays as it was: what is bounded of it is no such
-        quadratic.
+        quadratic. For the same reason one may become slower than it had to.
 
         Args:
             motion: N motions, with the problem's numbers of control points.
