@@ -62,11 +62,8 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
     """
     import casadi as ca
 
-    orders = problem.path_orders
-    names = (*(f"p{order}" for order in range(orders)), "rates", "tops")
-    widths = (*[robot.n] * orders, orders - 1, count_numbers(problem.obstacle))
-    columns, (p, *path, rate, tops) = zip(*map(symbols, names, widths), strict=True)
-    (p1, p2), (r, r1) = path[:2], rate[:2]
+    columns, (p, *path, rate, tops) = _on_path(robot, problem)
+    orders, (p1, p2), (r, r1) = problem.path_orders, path[:2], rate[:2]
     dq = [slope * r for slope in p1]
     ddq = [(curve * r + slope * r1) * r for curve, slope in zip(p2, p1, strict=True)]
     moving = tuple(ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders))
@@ -79,6 +76,36 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
                 out += [value - float(high)] if np.isfinite(high) else []
     worst = reduce(ca.fmax, out) if out else ca.SX(-1)
     return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
+
+
+def speed_coefficients(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(the column of speed_excess) -> rest, square, mixed`` of what bounds rates on a given path.
+
+    Values of ``speed_residuals`` that are quadratic in dq, without a linear part, and linear in ddq are ``rest +
+    square r^2 + mixed r r'``. Of those that are proportional to dq the square of the largest share of a bound is, and
+    it stands for all as the last row. Bounds are those of ``coefficient_bounds``.
+    """
+    import casadi as ca
+
+    columns, values, still = _on_path(robot, problem)[0], speed_residuals(robot, problem), ca.SX.zeros(robot.n)
+    p, p1, p2, _, tops = columns
+    rest, fast, rising = (values(p, *moving, tops) for moving in ((still, still), (p1, p2), (still, p1)))
+    bounds = speed_bounds(robot, problem)
+    others, shares = np.flatnonzero(~bounds.proportional).tolist(), []
+    for bound in (bounds.lower, bounds.upper):
+        rows = np.flatnonzero(bounds.proportional & np.isfinite(bound)).tolist()
+        shares += [fast[row] * float(1 / bound[row]) for row in rows]
+    largest = [reduce(ca.fmax, shares, ca.SX(0)) ** 2] if shares else []
+    nothing = [ca.SX.zeros(len(largest))]
+    found = [(rest, nothing), (fast - rest, largest), (rising - rest, nothing)]
+    outputs = [ca.densify(ca.vertcat(each[others], *last)) for each, last in found]
+    return ca.Function("speed_coefficients", [ca.vertcat(*columns)], ca.cse(outputs))
+
+
+def coefficient_bounds(bounds: "SpeedBounds") -> tuple[Array, Array]:
+    """Lower and upper bounds of the rows of ``speed_coefficients``, from those of ``speed_residuals``."""
+    others, shares = ~bounds.proportional, int(bounds.proportional.any())
+    return np.append(bounds.lower[others], [-np.inf] * shares), np.append(bounds.upper[others], [1.0] * shares)
 
 
 def rest_excess(robot: "Robot", problem: Problem) -> Any:
@@ -104,14 +131,50 @@ def useful_steps(kernels: KernelLibrary, steps: int) -> int:
     return steps if steps and kernels.tape(equality_residuals).outputs[0] > 0 else 0
 
 
-def speed_bounds(robot: "Robot", problem: Problem) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Lower and upper bounds of the rows of ``speed_residuals``, and which depend on the jerk, shape (m,) each."""
-    found = [(condition, needs == 3) for condition, needs in _any_conditions(robot, problem) if needs]
-    return (
-        np.concatenate([condition.lower for condition, _ in found] or [np.empty(0)]),
-        np.concatenate([condition.upper for condition, _ in found] or [np.empty(0)]),
-        np.array([cubic for condition, cubic in found for _ in condition.g], bool),
-    )
+@dataclass(frozen=True)
+class SpeedBounds:
+    """What is known of the rows of ``speed_residuals``, shape (m,) each.
+
+    Attributes:
+        lower: Lower bounds.
+        upper: Upper bounds.
+        cubic: Which depend on the jerk.
+        proportional: Which are proportional to dq, with a bound on one side of zero or on either.
+    """
+
+    lower: Array
+    upper: Array
+    cubic: NDArray[np.bool_]
+    proportional: NDArray[np.bool_]
+
+
+def speed_bounds(robot: "Robot", problem: Problem) -> SpeedBounds:
+    """Find the bounds of the rows of ``speed_residuals``."""
+    state, tops = _moving(problem, symbols("q", robot.n)[1]), symbols("tops", count_numbers(problem.obstacle))[1]
+    rows = [
+        (low, high, needs == 3, needs == 1 and _is_proportional(value, state.moving[0], low, high))
+        for condition, needs in _conditions(robot, problem, state, tops)
+        if needs
+        for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True)
+    ]
+    lower, upper, cubic, proportional = np.array(rows, float).reshape(-1, 4).T
+    return SpeedBounds(lower, upper, cubic.astype(bool), proportional.astype(bool))
+
+
+def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:
+    import casadi as ca
+
+    linear = ca.is_linear(value, dq) and ca.substitute(value, dq, ca.SX.zeros(dq.shape)).is_zero()
+    return bool(linear and low < 0 < high and np.isfinite([low, high]).any())
+
+
+def _on_path(robot: "Robot", problem: Problem) -> tuple[list[Any], list[Vec]]:
+    """Name p, p', p'', ..., r, r', ... and tops, as SX columns and as lists of their scalars."""
+    orders = problem.path_orders
+    names = (*(f"p{order}" for order in range(orders)), "rates", "tops")
+    widths = (*[robot.n] * orders, orders - 1, count_numbers(problem.obstacle))
+    columns, scalars = zip(*map(symbols, names, widths), strict=True)
+    return list(columns), list(scalars)
 
 
 @dataclass(frozen=True)
@@ -129,11 +192,6 @@ def _moving(problem: Problem, q: Vec) -> _State:
     names = ("dq", "ddq", "jerk")[: problem.path_orders - 1]
     columns, (dq, ddq, *third) = zip(*(symbols(name, len(q)) for name in names), strict=True)
     return _State(q, dq, ddq, third[0] if third else None, columns)
-
-
-def _any_conditions(robot: "Robot", problem: Problem) -> list[tuple[Condition, int]]:
-    tops = symbols("tops", count_numbers(problem.obstacle))[1]
-    return _conditions(robot, problem, _moving(problem, symbols("q", robot.n)[1]), tops)
 
 
 def _conditions(robot: "Robot", problem: Problem, state: _State, tops: Vec) -> list[tuple[Condition, int]]:

@@ -46,19 +46,17 @@ class Preparation:
     Attributes:
         problem: The problem.
         velocity_limit: Planning limits [rad/s], shape (n,).
-        acceleration_limit: Planning limits [rad/s^2], shape (n,).
         tips: Kernel of ``curves.tips_at_ends``.
         line: Kernel of ``curves.line_bend``; None where the line stays straight.
-        expected_time: Which of ``EXPECTED_TIMES`` is taken.
+        reaching_time: Kernel of ``tasks.reaching_time``; None where the time of the distance is expected.
         corner: Kernel of ``curves.corner_bend``; None where there are no lines with corners, or they are not bent.
     """
 
     problem: Problem
     velocity_limit: Array
-    acceleration_limit: Array
     tips: Kernel
     line: Kernel | None
-    expected_time: str = "distance"
+    reaching_time: Kernel | None = None
     corner: Kernel | None = None
 
     def __call__(self, boundary: Boundary, middle: Array | None = None, *, ends: Array | None = None) -> Tasks:
@@ -71,7 +69,8 @@ class Preparation:
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz = (tip.T for tip in self.tips(ends))
-        time = self._time(boundary)
+        reaching = self.reaching_time
+        time = expected_time(boundary, self.velocity_limit) if reaching is None else reaching(ends)[0][0]
         correction = None if middle is None else self._aside(boundary, middle)
         bend, aside = (self.line, []) if correction is None else (self.corner, [lanes(correction)])
         if bend is not None:
@@ -84,11 +83,6 @@ class Preparation:
         along = along_line(self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal)
         aside = middle - (boundary.start_q + boundary.goal_q) / 2
         return np.asarray((1 - np.abs(2 * along - 1)) * aside[:, None])
-
-    def _time(self, boundary: Boundary) -> Array:
-        if self.expected_time == "distance":
-            return expected_time(boundary, self.velocity_limit)
-        return reaching_time(boundary, self.velocity_limit, self.acceleration_limit)
 
     def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
         """Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers)."""
@@ -121,7 +115,7 @@ def prepare_tasks(
     steps = useful_steps(kernels, bending_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
     line = load(line_bend) if steps else None
-    limits = robot.velocity_limit, robot.acceleration_limit
     tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
+    time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
     corner = load(corner_bend) if steps and corners else None
-    return Preparation(problem, *limits, tips, line, expected_time, corner)
+    return Preparation(problem, robot.velocity_limit, tips, line, time, corner)

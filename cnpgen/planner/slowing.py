@@ -6,12 +6,15 @@ b and c, and the smallest k at which every g is within its bounds follows in clo
 is ``g0 + d / k^3``.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.expressions import SpeedBounds, speed_bounds, speed_residuals
 from cnpgen.planner.speeds import BLOCK, Speeds, load_speeds
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.motion import Motion
@@ -22,11 +25,21 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 SLOWEST = 3.0  # no motion is slowed down more: what breaks limits by so much is no plan
+INTERVALS = 128  # between phases
 SPARE = 2e-4  # relative: between two phases a limit may be exceeded by about this much
 
 
+@dataclass(frozen=True)
 class Slowing(Speeds):
-    """Finds how much slower motions of one problem must be; made by ``make_slowing``."""
+    """Finds how much slower motions of one problem must be; made by ``make_slowing``.
+
+    Attributes:
+        residuals: Kernel of ``expressions.speed_residuals``.
+        bounds: Those of its values.
+    """
+
+    residuals: Kernel
+    bounds: SpeedBounds
 
     def factor(self, motion: Motion, tops: Array) -> Array:
         """Smallest factor, at least 1, by which each of N motions from rest to rest must be slower.
@@ -42,26 +55,15 @@ class Slowing(Speeds):
         """
         factor, phases = np.ones(len(motion)), self.path.shape[1]
         for block in (slice(first, first + BLOCK) for first in range(0, len(motion), BLOCK)):
-            column = self._column(motion[block], tops[block])
+            column = self.column(motion[block], tops[block])
             (excess,) = self.excess(column)
             over = np.flatnonzero(excess[0] > 0)  # most motions are slow enough everywhere, and one look tells
             if len(over):
                 np.maximum.at(factor[block], over // phases, self._needed(column.take(over, axis=1)))
         return np.where(factor > 1, np.minimum(factor * (1 + SPARE), SLOWEST), 1.0)
 
-    def _column(self, motion: Motion, tops: Array) -> Array:
-        """Lay out p, p', ..., r, r', ... and obstacles at all phases of N motions, shape (width, N K)."""
-        (orders, phases, points), (count, _, n) = self.path.shape, motion.path.shape
-        first, last = orders * n, orders * n + orders - 1
-        out = np.empty((last + tops.shape[1], count * phases))
-        path = motion.path.transpose(2, 0, 1).reshape(n * count, points)
-        np.matmul(path, self.path.swapaxes(1, 2), out=out[:first].reshape(orders, n * count, phases))
-        np.matmul(motion.rate, self.rate.swapaxes(1, 2), out=out[first:last].reshape(orders - 1, count, phases))
-        out[last:].reshape(-1, count, phases)[:] = tops.T[..., None]
-        return out
-
     def _needed(self, column: Array) -> Array:
-        """Smallest factors that L of the columns of ``_column`` ask for, shape (L,)."""
+        """Smallest factors that L of the columns of ``column`` ask for, shape (L,)."""
         n, orders = self.residuals.tape.inputs[0], len(self.path)
         p, p1, p2, *third = column[: orders * n].reshape(orders, n, -1)
         (r, r1, *second), tops = column[orders * n :][: orders - 1], column[orders * n + orders - 1 :]
@@ -73,9 +75,10 @@ class Slowing(Speeds):
         )
         quadratic = 2 * (fast - 2 * slow + rest)  # c, from g(1) = rest + b + c and g(2) = rest + b / 2 + c / 4
         linear = fast - rest - quadratic
-        above, below = self.upper[:, None] - rest, rest - self.lower[:, None]
+        above, below = self.bounds.upper[:, None] - rest, rest - self.bounds.lower[:, None]
         needed = np.maximum(_smallest(above, linear, quadratic), _smallest(below, -linear, -quadratic))
-        change, cubic = (fast - rest)[self.cubic], self.cubic
+        cubic = self.bounds.cubic
+        change = (fast - rest)[cubic]
         needed[cubic] = np.maximum(_smallest_cubic(above[cubic], change), _smallest_cubic(below[cubic], -change))
         return np.asarray(needed.max(axis=0, initial=1.0))
 
@@ -88,7 +91,8 @@ def make_slowing(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> Sl
         robot: Its robot.
         kernels: Where kernels are loaded from.
     """
-    return Slowing(**vars(load_speeds(problem, robot, kernels)))
+    speeds, residuals = load_speeds(problem, kernels, INTERVALS), kernels.load(speed_residuals)
+    return Slowing(speeds.excess, speeds.path, speeds.rate, residuals, speed_bounds(robot, problem))
 
 
 def _smallest(room: Array, linear: Array, quadratic: Array) -> Array:

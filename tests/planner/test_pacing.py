@@ -3,15 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.planner.pacing import MOST, advance, make_pacing, smallest
+from cnpgen.planner.expressions import coefficient_bounds, speed_bounds
+from cnpgen.planner.pacing import MOST, Pacing, advance, make_pacing, smallest
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
+from cnpgen.problems.obstacles import obstacle_tops
 from cnpgen.trajectory.motion import Motion
 from tests.conftest import columns_of, needs_compiler
+from tests.examples.constraints import TipSpeed
 from tests.examples.jerky import jerky
 from tests.examples.models import boundary_of_columns, interpreted, surroundings_of, untrained_model
 from tests.planner.test_parts import LIMITS
@@ -98,13 +102,66 @@ def test_a_motion_that_is_none_touches_no_other(motion, pacing):
     np.testing.assert_array_equal(found.rate[others], expected.rate[others])
 
 
+def compiled_pacing(name: str) -> Pacing:
+    given = surroundings_of(name)
+    found = make_pacing(given.problem, given.robot, given.kernels)
+    assert found.library is not None
+    return found
+
+
 @needs_compiler
-def test_compiled_and_interpreted_pacing_agree(given, motion, pacing):
-    compiled = make_pacing(given.problem, given.robot, given.kernels)
-    assert compiled.library is not None
+def test_compiled_and_interpreted_pacing_agree(motion, pacing):
+    compiled = compiled_pacing("airhockey")
     assert pacing.library is None
     for each in (motion, quickened(motion, 3.0)):
         np.testing.assert_allclose(compiled.paced(each, TOPS).rate, pacing.paced(each, TOPS).rate, rtol=1e-8)
+    wide = [replace(each, lower=2 * each.lower, upper=2 * each.upper) for each in (compiled, pacing)]
+    slow = quickened(pacing.paced(motion, TOPS), 0.9)
+    np.testing.assert_array_equal(*(each.paced(slow, TOPS).rate for each in wide))
+    np.testing.assert_array_equal(wide[0].paced(slow, TOPS).rate, slow.rate)
+    broken = replace(motion, rate=np.where(np.arange(COUNT)[:, None] == 3, np.nan, motion.rate))
+    found = compiled.paced(broken, TOPS).rate
+    np.testing.assert_array_equal(np.delete(found, 3, axis=0), np.delete(compiled.paced(motion, TOPS).rate, 3, axis=0))
+    assert np.isnan(found[3]).all()
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_compiled_and_interpreted_pacing_agree_among_obstacles(tiny):
+    """Only there has a state more numbers than the motion; compiling its kernels takes some seconds."""
+    given, boundary = surroundings_of("heavy-object"), boundary_of_columns(columns_of(tiny("heavy-object")), COUNT)
+    plans = Planner("heavy-object", backend="numpy").plan_batch(boundary)
+    tops = obstacle_tops(given.problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    assert tops.size
+    calm = make_pacing(given.problem, given.robot, interpreted(given).kernels)
+    found = compiled_pacing("heavy-object").paced(plans.motion, tops).rate
+    np.testing.assert_allclose(found, calm.paced(plans.motion, tops).rate, rtol=1e-8)
+    assert (found != plans.motion.rate).any()
+
+
+def test_coefficients_are_those_of_accelerations_torques_and_squared_shares_of_velocities(given, pacing):
+    """By Pinocchio, of random paths and rates."""
+    random, robot, count = np.random.default_rng(7), given.robot, 5
+    data = robot.model.createData()
+    column = random.normal(size=(3 * robot.n + 2, count))
+    p, p1, p2, (r, r1) = *column[: 3 * robot.n].reshape(3, robot.n, count), np.abs(column[3 * robot.n :])
+    rest, square, mixed = pacing.coefficients(column)
+    dq, ddq = p1 * r, p2 * r**2 + p1 * r1 * r
+    torque = np.array([pin.rnea(robot.model, data, *state).copy() for state in zip(p.T, dq.T, ddq.T, strict=True)]).T
+    share = (np.abs(dq) / robot.velocity_limit[:, None]).max(axis=0, keepdims=True)
+    expected = np.concatenate([ddq, torque, share**2])
+    np.testing.assert_allclose(rest + square * r**2 + mixed * r * r1, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(pacing.upper, [*robot.acceleration_limit, *robot.torque_limit, 1.0])
+    np.testing.assert_allclose(pacing.lower, [*-robot.acceleration_limit, *-robot.torque_limit, -np.inf])
+
+
+def test_a_bound_of_something_else_than_a_velocity_keeps_a_row_of_its_own(given):
+    """The square of the tip's speed is none that is proportional to velocities, and has no lower bound."""
+    problem = replace(given.problem, constraint=(*given.problem.constraint, TipSpeed(highest=0.5)))
+    bounds = speed_bounds(given.robot, problem)
+    assert bounds.proportional.tolist() == [True] * 6 + [False] * 13
+    lower, upper = coefficient_bounds(bounds)
+    assert (lower[-2:].tolist(), upper[-2:].tolist()) == ([-np.inf, -np.inf], [0.25, 1.0])
 
 
 def test_the_smallest_root_is_that_of_numpy():
@@ -118,15 +175,15 @@ def test_the_smallest_root_is_that_of_numpy():
 
 
 def test_rates_go_on_to_the_first_bound():
-    """One row, one motion, two phases: g = r + r r', upper bound 3, from r = 1 and r' = 0 along (1, 1)."""
-    rest, linear, square, mixed = (np.full((1, 1, 2), each) for each in (0.0, 1.0, 0.0, 1.0))
+    """One row, one motion, two phases: g = r^2 + r r', upper bound 1.8, from r = 1 and r' = 0 along (1, 0.2)."""
+    coefficients = [np.full((1, 1, 2), each) for each in (0.0, 1.0, 1.0)]
     rates, along = np.stack([np.ones((1, 2)), np.zeros((1, 2))]), np.array([[[1.0, 0.2]], [[1.0, 0.2]]])
-    bounds = np.array([-np.inf]), np.array([1.6])
-    found = advance([rest, linear, square, mixed], bounds, rates, along)[0]
-    assert (1 + found) * (1 + found) == pytest.approx(1.6)
-    assert advance([rest, linear, square, mixed], (bounds[0], np.array([9.0])), rates, along)[0] == MOST
-    back = advance([rest, linear, square, mixed], (bounds[0], np.array([0.9])), rates, along[:, :, :1].repeat(2, 2))[0]
-    assert (1 + back) ** 2 == pytest.approx(0.9)
+    bounds = np.array([-np.inf]), np.array([1.8])
+    found = advance(coefficients, bounds, rates, along)[0]
+    assert (1 + found) * (1 + found) + (1 + found) * found == pytest.approx(1.8)
+    assert advance(coefficients, (bounds[0], np.array([9.0])), rates, along)[0] == MOST
+    back = advance(coefficients, (bounds[0], np.array([0.9])), rates, along[:, :, :1].repeat(2, 2))[0]
+    assert (1 + back) * (1 + back) + (1 + back) * back == pytest.approx(0.9)
 
 
 def test_plans_whose_jerk_is_bounded_are_not_paced(given):

@@ -10,8 +10,7 @@ from scipy.interpolate import BSpline
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.planner.expressions import equality_residuals, useful_steps
 from cnpgen.planner.kit import make_kit
-from cnpgen.planner.slowing import SLOWEST, make_slowing
-from cnpgen.planner.speeds import PHASES
+from cnpgen.planner.slowing import INTERVALS, SLOWEST, make_slowing
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.obstacles import obstacle_tops
@@ -140,11 +139,11 @@ def test_the_look_at_all_phases_finds_the_motions_that_need_to_be_slower_and_no_
     needed = slowing.factor(motion, tops)
     for pace in (1.0, np.median(needed), 0.999 * needed.max(), 1.01 * needed.max()):
         slower = motion.slower(np.full(12, pace))
-        states = slower.at(chebyshev(PHASES))
+        states = slower.at(chebyshev(INTERVALS))
         lanes = [np.ascontiguousarray(part.reshape(-1, 7).T) for part in (states.q, states.dq, states.ddq)]
         (values,) = slowing.residuals(*lanes, np.repeat(tops.T, states.q.shape[1], axis=1))
-        out = np.maximum(values - slowing.upper[:, None], slowing.lower[:, None] - values).max(axis=0)
-        (excess,) = slowing.excess(slowing._column(slower, tops))
+        out = np.maximum(values - slowing.bounds.upper[:, None], slowing.bounds.lower[:, None] - values).max(axis=0)
+        (excess,) = slowing.excess(slowing.column(slower, tops))
         np.testing.assert_allclose(excess[0], out, atol=1e-9)
         np.testing.assert_array_equal(slowing.factor(slower, tops) > 1, out.reshape(12, -1).max(axis=1) > 0)
 
@@ -162,12 +161,12 @@ def test_slowed_motions_keep_limited_jerks_and_slightly_faster_ones_do_not(fast,
     _, _, _, motion, tops = fast
     problem, robot = jerky("heavy-object", 2.0)
     slowing = make_slowing(problem, robot, problem_kernels(problem, robot, "numpy", tmp_path))
-    assert slowing.cubic.tolist() == [False] * (len(slowing.cubic) - 7) + [True] * 7
+    assert slowing.bounds.cubic.tolist() == [False] * (len(slowing.bounds.cubic) - 7) + [True] * 7
     factor = slowing.factor(motion, tops)
     needed = (factor > 1.01) & (factor < SLOWEST)
 
     def worst(factor: np.ndarray) -> np.ndarray:
-        jerk = motion.slower(factor).at(chebyshev(PHASES)).jerk / robot.jerk_limit
+        jerk = motion.slower(factor).at(chebyshev(INTERVALS)).jerk / robot.jerk_limit
         return np.abs(jerk).max(axis=(1, 2))
 
     alone = np.cbrt(worst(np.ones(12)))  # what jerks alone ask for

@@ -1,5 +1,7 @@
 """Expected times: that of the distance, and the least time of joints with bounded velocity and acceleration."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -14,8 +16,12 @@ STEPS = 80
 
 
 def one_joint(q0: float, v0: float, q1: float, v1: float, *, velocity: float, acceleration: float) -> float:
-    state = [np.array([[value]]) for value in (q0, v0, 0.0, q1, v1)]
-    return float(reaching_time(Boundary(*state), np.array([velocity]), np.array([acceleration]))[0])
+    return reaching(np.array([q0, v0, 0.0, q1, v1]), np.array([velocity]), np.array([acceleration]))
+
+
+def reaching(ends: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> float:
+    robot = SimpleNamespace(n=len(velocity), velocity_limit=velocity, acceleration_limit=acceleration)
+    return float(reaching_time(robot, fixed_at_goal=2)(ends))
 
 
 def can_reach(time: float, q0: float, v0: float, q1: float, v1: float, velocity: float, acceleration: float) -> bool:
@@ -45,11 +51,10 @@ def test_no_joint_gets_there_sooner_and_every_one_can_get_there_then() -> None:
 
 
 def test_the_slowest_joint_counts_and_no_time_is_shorter_than_the_floor() -> None:
-    zero = np.zeros((1, 2))
-    far = Boundary(zero, zero, zero, np.array([[0.1, 1.0]]), zero)
-    limits = np.array([1.0, 1.0]), np.array([10.0, 10.0])
-    assert reaching_time(far, *limits)[0] == pytest.approx(1.0 / 1.0 + 1.0 / 10.0)  # cruising, and both ramps
-    assert reaching_time(Boundary(zero, zero, zero, zero, zero), *limits)[0] == SHORTEST_REACH
+    limits, far = (np.array([1.0, 1.0]), np.array([10.0, 10.0])), np.array([0.1, 1.0])
+    ends = np.concatenate([np.zeros(6), far, np.zeros(2)])
+    assert reaching(ends, *limits) == pytest.approx(1.0 / 1.0 + 1.0 / 10.0)  # cruising, and both ramps
+    assert reaching(np.zeros(10), *limits) == SHORTEST_REACH
 
 
 def test_who_moves_the_wrong_way_takes_longer() -> None:
@@ -62,7 +67,8 @@ def test_control_points_for_other_frameworks_may_be_of_either_time() -> None:
     boundary = Boundary(*random.uniform(-0.3, 0.3, (5, 3, 6)))
     omega = Omega("airhockey", bending_steps=0, landing_steps=0, expected_time="reach", backend="numpy")
     robot = ROBOTS["airhockey"]
-    expected = reaching_time(boundary, robot.velocity_limit, robot.acceleration_limit)
+    limits = robot.velocity_limit, robot.acceleration_limit
+    expected = [reaching(ends, *limits) for ends in np.concatenate(list(boundary.given().values()), axis=1)]
     np.testing.assert_allclose(omega.tasks(boundary).expected_time, expected, rtol=1e-12)
     with pytest.raises(UsageError, match="expected_time must be one of distance, reach, got 'soon'"):
         Omega("airhockey", expected_time="soon")
