@@ -242,7 +242,7 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
     joints = len(plans.problem.joint_names)
     if n != joints:
         yield f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}"
-    fewest = max(degree + 2, 3 + plans.boundary.fixed_at_goal)
+    fewest = plans.boundary.fewest_points(degree)
     if points < fewest:
         yield f"path_control_points must have at least {fewest} of degree {degree}, got shape {path.shape}"
     most = max(points, rate.shape[-1] if rate.ndim else 0)

@@ -122,6 +122,8 @@ class Refiner:
             return
         if given is not None and self.coarser is not None:
             yield from self._by_coarser(self.coarser, task, given)
+            if self.check.refutes_ends(task):
+                return
         repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
         best = yield from self._passes(task, given, repaired)
         if self.check.refutes_ends(task):
@@ -142,8 +144,10 @@ class Refiner:
     def _by_coarser(self, coarser: "Refiner", task: Task, given: Array) -> Iterator[Attempt]:
         """Yield what the passes make of a plan with fewer control points, written with all of them.
 
-        With three times as many a step takes ten times as long, for motions that are 0.15 % faster.
+        With three times as many a step takes ten times as long, for objectives that are 0.3 % lower.
         """
+        if coarser.spec.path_control_points < task.boundary.fewest_points(coarser.spec.degree):
+            return
         own, fewer, degree = self.check.transcription(task), coarser.check.transcription(task), self.spec.degree
         path, rate = own.unpack(given)
         fitted = with_fewer_knots(Motion(path[None], rate[None], degree), task.boundary, coarser.spec)
@@ -152,6 +156,8 @@ class Refiner:
             path, rate = fewer.unpack(attempt.x)
             same = with_finer_knots(Motion(path[None], rate[None], degree), self.spec)
             yield replace(attempt, x=own.pack(same.path[0], same.rate[0]))
+        if task.deadline is not None:
+            task.deadline.longest *= (own.nx / fewer.nx) ** 2  # what steps with all of them may take
 
     def _restarted(
         self, task: Task, given: Array | None, line: Array, best: Attempt

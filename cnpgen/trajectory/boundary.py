@@ -83,6 +83,10 @@ class Boundary:
         """Number of path control points that the goal fixes (the paper's N_d)."""
         return 2 if self.goal_ddq is None else 3
 
+    def fewest_points(self, degree: int) -> int:
+        """Return how many path control points a spline of a degree needs at least to meet these conditions."""
+        return max(degree + 2, 3 + self.fixed_at_goal)
+
     def given(self) -> dict[str, Array]:
         """Return the boundary conditions that there are: name -> values."""
         return {name: values for name, values in vars(self).items() if values is not None}

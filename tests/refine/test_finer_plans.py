@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from cnpgen.plans.plans import make_plans
-from cnpgen.refine.engine import prepare
+from cnpgen.refine.engine import load_refiner, prepare
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.task import Attempt, Outcome, Refined, Task
 from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.rest import finer, with_fewer_knots, with_finer_knots
@@ -63,9 +64,9 @@ def test_where_that_gives_no_valid_plan_all_of_its_control_points_are_used(monke
 
     def over_its_limits(self: Refiner, *arguments: object) -> Iterator[Attempt]:
         for attempt in passes(self, *arguments):  # type: ignore[arg-type]
-            if self is tool.coarser:
-                attempt.x[-self.spec.rate_control_points + 3 : -3] += 0.3
-            yield attempt
+            faster = np.zeros_like(attempt.x)
+            faster[-self.spec.rate_control_points + 3 : -3] = 0.3 if self is tool.coarser else 0.0
+            yield replace(attempt, x=attempt.x + faster)
 
     monkeypatch.setattr(Refiner, "_passes", over_its_limits)
     found = refined(plan, tool, asked)
@@ -80,3 +81,29 @@ def test_plans_with_other_numbers_of_control_points_are_refined_with_their_own()
     own = plan.problem.trajectory
     for spec in (own, replace(own, path_control_points=own.path_control_points + 4)):
         assert tool_of(plan, spec).coarser is None
+
+
+def test_where_the_problem_has_too_few_control_points_the_plan_is_refined_with_its_own() -> None:
+    shipped = load("hit")
+    own = TrajectorySpec(degree=7, path_control_points=8, rate_control_points=8)
+    plan = replace(shipped, problem=replace(shipped.problem, trajectory=own))
+    tool = load_refiner(plan.problem, plan.robot, spec=finer(own, 2), coarser=load_refiner(plan.problem, plan.robot))
+    motion = tool.check.transcription(task(plan))
+    path, rate = motion.unpack(tool.straight(task(plan)))
+    assert refined(plan, tool, task(plan, path=path, rate=rate)).valid
+
+
+def test_before_a_deadline_steps_with_all_control_points_are_known_to_take_longer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plan = load("hit")
+    spec = finer(plan.problem.trajectory, 3)
+    tool, deadline = tool_of(plan, spec), Deadline(np.inf)
+    asked = replace(slower(plan, spec), deadline=deadline)
+    attempts, given = tool.attempts(asked, tool.given(asked)), tool.given(asked)
+    assert given is not None
+    coarse = [next(attempts) for _ in range(3)]
+    before = deadline.longest
+    monkeypatch.setattr(tool, "_passes", lambda *_: iter([coarse[-1]]))
+    next(attempts)
+    assert deadline.longest > 5 * before > 0

@@ -1,6 +1,6 @@
 """The refiner: exact derivatives, plans that the independent verdict calls valid, honest outcomes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,9 @@ from cnpgen.judges.plans import Verdict
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
+from cnpgen.plans.plans import Plans
 from cnpgen.problems.record import open_problem
-from cnpgen.refine.engine import load_refiner, tasks_of
+from cnpgen.refine.engine import load_refiner, prepare, tasks_of
 from cnpgen.refine.jury import Jury
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.passes import Pass
@@ -23,6 +24,7 @@ from cnpgen.refine.solver import compiled, quadratic, sqp, starts
 from cnpgen.refine.solver.bounds import FULL, Bounds
 from cnpgen.refine.solver.compiled import CompiledSteps
 from cnpgen.refine.solver.criterion import Criterion, choose_criterion, criterion_residuals
+from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.quadratic import Near, PlainSteps, Steps
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
@@ -571,18 +573,47 @@ def test_first_steps_from_a_plan_hold_accelerations_that_are_far_from_their_limi
     assert steps[1] < 0.95 * steps[0]
 
 
+def rests(shortest: float, longest: float) -> Plans:
+    """What is left of plans shortly before they end: a step of 1e-4 rad breaks their limits by its square."""
+    planner = Planner("airhockey-replan")
+    plans = planner.plan_batch(draw_boundary_problems("airhockey-replan", 12, seed=61).boundary)
+    time = plans.duration - np.linspace(shortest, longest, len(plans))
+    found = planner.replan(plans, time, goal_q=plans.boundary.goal_q, goal_dq=plans.boundary.goal_dq)
+    np.testing.assert_allclose(found.duration, plans.duration - time)
+    return found
+
+
 @needs_compiler
-def test_rests_of_plans_of_hundredths_of_a_second_land_in_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step of a ten thousandth of a radian breaks the limits of such a motion by its square."""
-    plans = Planner("airhockey-replan").plan_batch(draw_boundary_problems("airhockey-replan", 12, seed=61).boundary)
-    time = plans.duration - np.linspace(0.04, 0.1, len(plans))
-    goal = {"goal_q": plans.boundary.goal_q, "goal_dq": plans.boundary.goal_dq}
-    rests = Planner("airhockey-replan").replan(plans, time, **goal)
-    np.testing.assert_allclose(rests.duration, plans.duration - time)
-    steps = {}
+def test_rests_of_hundredths_of_a_second_land_in_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans, steps = rests(0.04, 0.1), []
     for brief in (0.0, sqp.BRIEF):
         monkeypatch.setattr(sqp, "BRIEF", brief)
-        found = refine_plans(rests, workers=1)
+        found = refine_plans(plans, workers=1)
         assert found.valid.all()
-        steps[brief] = sum(each.iterations for each in found.refined)
-    assert steps[sqp.BRIEF] < 0.7 * steps[0.0]
+        steps.append(sum(each.iterations for each in found.refined))
+    assert steps[1] < 0.7 * steps[0]
+
+
+@dataclass
+class FewSteps(Deadline):
+    """A deadline after so many steps, however long they take."""
+
+    left: int = 5
+
+    def allows(self, steps: int) -> bool:
+        return steps <= self.left
+
+    def note(self, begun: float) -> None:
+        self.left -= 1
+
+
+@needs_compiler
+def test_before_a_deadline_rests_of_hundredths_of_a_second_land_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans = rests(0.02, 0.05)
+    tool, landed = prepare(plans, RefineOptions()), []
+    for brief in (0.0, sqp.BRIEF):
+        monkeypatch.setattr(sqp, "BRIEF", brief)
+        tasks = [replace(each, deadline=FewSteps(np.inf)) for each in tasks_of(plans)]
+        found = [tool.minimise(each, tool.passes.given, tool.given(each)) for each in tasks]
+        landed.append(sum(each.violation < tool.settings.violation_tolerance for each in found))
+    assert landed[1] > landed[0] + 2

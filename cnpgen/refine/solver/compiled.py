@@ -212,7 +212,8 @@ class CompiledSteps:
         dim = self._nx + 1
         rows = dim + self._m * self._points + BLOCK
         scratch = (2 * dim + BLOCK) * stride + 8 * (stride + BLOCK)
-        sizes = (rows * dim, rows, rows, rows, scratch, dim, rows // BLOCK + 1)  # as in _Polyhedron
+        blocks = rows  # some fewer: they are of 8 rows or more
+        sizes = (rows * dim, rows, rows, rows, scratch, dim, blocks)  # as in _Polyhedron
         return _Polyhedron(dim, stride, 0, *self._room(sizes))
 
     def _room(self, sizes: Sequence[int]) -> list[int]:

@@ -11,7 +11,7 @@ from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+Indices = NDArray[np.intp]
 NODES = 4  # Gauss nodes per cell of the time integral: wrong by less than 1e-9 of it
 CRITERION_NODES = 40
 BEGINNING = 1e-6  # a phase as good as 0, where jerks differ by some percent from those at the next point of a grid

@@ -31,7 +31,7 @@ LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
 LEAP = 1.5  # the next step may be longer than the last one by this factor
 NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # see ``Settings.near``
 LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
-BRIEF = 0.2  # s: it grows with the cube of how much shorter a motion is, in which a small step changes much
+BRIEF = 0.2  # s: in shorter motions landing is heavier with the cube of how much; small steps change much in them
 STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
 HEAVY = 3.0  # times the objective is what violations weigh where repairing them would not pay
 PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
@@ -172,8 +172,7 @@ class _Descent:
     def advance(self) -> None:
         """Try a step: take it, or know better for the next one."""
         settings, self.tightened = self._settings, False
-        landing = LANDING * max(BRIEF / self.cost, 1.0) ** 3
-        proximal = SHORTEST if self.landing else landing if self._settled or self._creeps else settings.proximal
+        proximal = self._landing_weight() if self.landing or self._settled or self._creeps else settings.proximal
         near = next(near for length, near in settings.near if self._length > length)
         where = Near(self.violation, near, LEAP * self._length, self._missed, self._multipliers)
         model = self._steps.model(self.x, self._g, where, proximal=proximal, penalty=self._penalty)
@@ -189,6 +188,10 @@ class _Descent:
         if self._is_stuck() and not self._creeps and self.violation < NEARLY:
             self._creeps, self._violations = True, [self.violation]
         self.ended |= self._radius < SMALLEST or self._is_stuck()
+
+    def _landing_weight(self) -> float:
+        brief = max(BRIEF / self._motion.duration(np.exp(self.x[self._motion.split :])), 1.0)
+        return (SHORTEST if self.landing else LANDING) * brief**3
 
     def _is_stuck(self) -> bool:
         """Whether it was never feasible, and the least violation hardly falls any more."""

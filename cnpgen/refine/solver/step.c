@@ -315,8 +315,8 @@ static int objective(motion *s, const double *x, double proximal) {
 /* How many numbers of a row of the programme are certainly 0 before the first that may be another. */
 static long leading(const motion *s, long row) {
   if (row <= s->nx) return row;
-  long zeros = (s->grid.path_from[s->where[row - s->nx - 1] % s->grid.points] - 3) * s->n, split = s->nx - s->rate;
-  return zeros < 0 ? 0 : zeros < split ? zeros : split;
+  long zeros = (s->grid.path_from[s->where[row - s->nx - 1] % s->grid.points] - 3) * s->n;
+  return zeros > 0 ? zeros : 0;
 }
 
 /* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, or than
