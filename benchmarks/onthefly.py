@@ -6,7 +6,7 @@ between 0.05 and 0.95 of their time T, where they are, off the table by what pla
 * "new puck": to a new puck, anywhere on the table, in a direction within 120 degrees of the way to it, at full speed in
   a fifth of the cases; the goal configuration is chosen close to where the arm is;
 * "same goal": to the goal of the motion; as the network plans it, and as ``replan`` answers, which keeps the rest of
-  the motion where the network is not faster by 2 %;
+  the motion where the network is not faster by 2 %; where that has finer knots, also refined with all of them;
 * "near the base": to goals of the dataset airhockey-hit at full speed, chosen close to the base configuration;
 * "another problem's": to goals of the dataset airhockey-replan, chosen close to other starts;
 * "on refined plans": as "new puck", from motions that were refined before they were executed;
@@ -36,10 +36,13 @@ from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import ProblemRecord
+from cnpgen.problems.record import ProblemRecord, open_problem
+from cnpgen.refine.engine import load_refiner
 from cnpgen.refine.options import DEFAULT
 from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.refiner import Refiner
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spec import TrajectorySpec
 
 FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the first motions
 MOMENTS = (0.05, 0.95)  # of T
@@ -155,37 +158,74 @@ def measure(planner: Planner, problems: Problems, refined: int) -> dict[str, flo
     """Plan, judge, refine some; also what replanning answers where the goal has not moved."""
     plans = planner.plan_batch(problems.boundary)
     made = refine_each(plans[:refined])
-    found = figures(plans, made)
+    found = figures([plans], made)
     if problems.executed is None or problems.time is None:
         return found
-    goal = {"goal_q": problems.boundary.goal_q, "goal_dq": problems.boundary.goal_dq}
-    answers = planner.replan(problems.executed, problems.time, **goal)
-    others, left = refine_each(answers[:refined]), problems.executed.duration - problems.time
+    answers = replanned(planner, problems, problems.executed, problems.time)
+    others = [each for answer in answers[:refined] for each in refine_each(answer)]
     found |= {f"replan, {what}": value for what, value in figures(answers, others).items() if what != "problems"}
     good = np.array([one.valid and other.valid for one, other in zip(made, others, strict=True)])
     best = np.array([min(one.duration, other.duration) for one, other in zip(made, others, strict=True)])[good].mean()
-    return found | {
-        "replan, rests of the old plan": float((np.abs(answers.duration - left) < SAME_TIME).mean()),
-        "T / best refined of both": float(plans.duration[:refined][good].mean() / best),
-        "replan, T / best refined of both": float(answers.duration[:refined][good].mean() / best),
+    given, left = durations(answers), problems.executed.duration - problems.time
+    return (
+        found
+        | {
+            "replan, rests of the old plan": float((np.abs(given - left) < SAME_TIME).mean()),
+            "T / best refined of both": float(plans.duration[:refined][good].mean() / best),
+            "replan, T / best refined of both": float(given[:refined][good].mean() / best),
+        }
+        | finely(answers[:refined], others, plans.motion.spec)
+    )
+
+
+def replanned(planner: Planner, problems: Problems, executed: Plans, time: NDArray[np.float64]) -> list[Plans]:
+    """Replan to goals that have not moved, one after the other, as a robot does."""
+    goals = problems.boundary
+    rows = (slice(i, i + 1) for i in range(len(executed)))
+    return [planner.replan(executed[i], time[i], goal_q=goals.goal_q[i], goal_dq=goals.goal_dq[i]) for i in rows]
+
+
+def finely(plans: list[Plans], usual: list[Made], spec: TrajectorySpec) -> dict[str, float]:
+    """Refine plans with finer knots with all of their control points, and say what that takes and gains."""
+    pairs = [(each, made) for each, made in zip(plans, usual, strict=True) if each.motion.spec != spec]
+    if not pairs:
+        return {}
+    fine = [made for each, _ in pairs for made in refine_each(each, load_refiner_of(each))]
+    ratio = [one.duration / other.duration for (_, one), other in zip(pairs, fine, strict=True) if other.valid]
+    return {
+        "replan, with finer knots": len(pairs) / len(plans),
+        "replan, finer knots, refine, median ms": median(made.ms for _, made in pairs),
+        "replan, finer knots, refine with all of them, median ms": median(made.ms for made in fine),
+        "replan, finer knots, refined / refined with all of them": float(np.mean(ratio)),
     }
 
 
-def refine_each(plans: Plans) -> list[Made]:
+def load_refiner_of(plans: Plans) -> Refiner:
+    """Load a refiner that uses all control points of plans."""
+    problem, robot = open_problem(plans.problem)
+    return load_refiner(problem, robot, spec=plans.motion.spec)
+
+
+def refine_each(plans: Plans, refiner: Refiner | None = None) -> list[Made]:
     """Refine plans one by one, with one BLAS thread."""
     with one_thread():
-        return make_each(plans, DEFAULT)
+        return make_each(plans, DEFAULT, refiner)
 
 
-def figures(plans: Plans, made: list[Made]) -> dict[str, float]:
+def durations(parts: list[Plans]) -> NDArray[np.float64]:
+    """Motion times [s]."""
+    return np.concatenate([each.duration for each in parts])
+
+
+def figures(parts: list[Plans], made: list[Made]) -> dict[str, float]:
     """Say how good plans are, and the first of them beside what was refined from them."""
-    good = np.array([each.valid for each in made])
+    good, given = np.array([each.valid for each in made]), durations(parts)
     after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
     return {
-        "problems": len(plans),
-        "valid alone": float(evaluate_plans(plans).valid.mean()),
+        "problems": len(given),
+        "valid alone": float(np.concatenate([evaluate_plans(each, workers=1).valid for each in parts]).mean()),
         "valid refined": float(good.mean()),
-        "T / refined": float(plans.duration[: len(made)][good].mean() / after[good].mean()),
+        "T / refined": float(given[: len(made)][good].mean() / after[good].mean()),
         "refine, median ms": median(ms),
         "refine, p95 ms": float(np.quantile(ms, 0.95)),
     }

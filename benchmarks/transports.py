@@ -138,7 +138,7 @@ def main() -> None:
         for name, boundary in problems.items():
             progress(f"{model}: {name}")
             plans = planner.plan_batch(boundary)
-            found = figures(plans, refine_each(plans[: chosen.refined]))
+            found = figures([plans], refine_each(plans[: chosen.refined]))
             results.setdefault(model, {})[name] = found
             rows += rows_of(model, name, found, goals_of(name))
             if chosen.again:
