@@ -67,7 +67,7 @@ class PathWorld:
         self._scene = Scene(object_size, 1)
         self._bodies = None if robot.shape is None else Bodies(robot.shape, len(obstacles), robot.n)
         rest = np.zeros((robot.n, 1))
-        self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles))
+        self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
 
     def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
         """Move to K states.
