@@ -45,7 +45,6 @@ class PathWorld:
         ddq: Joint accelerations [rad/s^2], shape (n, K).
         jerk: Joint jerks [rad/s^3], shape (n, K); None where no constraint is about them.
         tip_position: Positions of the tip [m], shape (3, K).
-        tip_rotation: Rotation matrices of the tip frame, shape (3, 3, K).
     """
 
     def __init__(
@@ -62,6 +61,9 @@ class PathWorld:
         self._data, self._trace = self._model.createData(), Trace(self._model)
         self._pool = pin.ModelPool(self._model, 1)
         self._tip = robot.tip_frame
+        frame = self._model.frames[self._tip]
+        self._carrier, tip = frame.parentJoint, frame.placement.homogeneous
+        self._turn, self._offset = tip[:3, :3], tip[:3, 3].copy()
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
         self._object_size = None if object_size is None else np.array(object_size)
         self._scene = Scene(object_size, 1)
@@ -92,12 +94,21 @@ class PathWorld:
 
     def _move(self) -> None:
         """Run the forward kinematics of every state and keep where the joints and the tip are."""
-        frame = self._model.frames[self._tip]
         self._rotations, self._origins = self._trace.poses(self.q)
-        rotation, placement = self._rotations[frame.parentJoint], frame.placement
-        self.tip_rotation = np.tensordot(placement.rotation.T, rotation, axes=(1, 1)).transpose(1, 0, 2)
-        along = np.tensordot(placement.translation, rotation, axes=(0, 1))
-        self.tip_position = along + self._origins[frame.parentJoint]
+        self._tip_rotation: Array | None = None
+        along = self._offset @ self._axes_of_tip()
+        self.tip_position = along.reshape(3, -1) + self._origins[self._carrier]
+
+    def _axes_of_tip(self) -> Array:
+        """Return the axes of the joint that carries the tip, all their components and states in a row, (3, 3 K)."""
+        return self._rotations[self._carrier].swapaxes(0, 1).reshape(3, -1)
+
+    @property
+    def tip_rotation(self) -> Array:
+        """Rotation matrices of the tip frame, shape (3, 3, K)."""
+        if self._tip_rotation is None:
+            self._tip_rotation = (self._turn.T @ self._axes_of_tip()).reshape(3, 3, -1).swapaxes(0, 1)
+        return self._tip_rotation
 
     @property
     def torque(self) -> Array:
@@ -218,11 +229,10 @@ class PathWorld:
         Returns:
             Shape (n,).
         """
-        frame, bodies = self._model.frames[self._tip], self._bodies
+        bodies = self._bodies
         spread = np.array([bodies.spread(joint) if bodies else 0.0 for joint in range(self.robot.n + 1)])
         held = 0.0 if self._object_size is None else np.linalg.norm(self._object_size) / 2
-        tip = np.linalg.norm(frame.placement.translation) + held
-        spread[frame.parentJoint] = max(spread[frame.parentJoint], tip)
+        spread[self._carrier] = max(spread[self._carrier], np.linalg.norm(self._offset) + held)
         return self._trace.reach(spread, furthest)
 
     def _placed_bodies(self) -> Bodies:
