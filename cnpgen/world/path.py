@@ -1,7 +1,7 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -86,7 +86,7 @@ class PathWorld:
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
-        self._pairs: dict[str | int, PairDistances] = {}
+        self._pairs: dict[str, PairDistances] = {}
         self._object_distances: list[Array] | None = None
         self._solids = solids_of(self.obstacles, tops)
         self._scene.place(self._solids)
@@ -167,8 +167,8 @@ class PathWorld:
     def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids
         ends = [(segment, solid) for segment in segments for solid in solids]
-        corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
-        bounds = [gaps(low, high, solid) for low, high in corners for solid in solids]
+        low, high = (pick(segments[:, 0], segments[:, 1]) for pick in (np.minimum, np.maximum))
+        bounds = gaps(low, high, solids).reshape(-1, self.q.shape[1])
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             a, b = ends[pair][0][..., k].tolist()
@@ -177,7 +177,7 @@ class PathWorld:
         def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
             return separation(ends[pair][0][..., which], ends[pair][1], direction)
 
-        return PairDistances(np.array(bounds).reshape(len(bounds), self.q.shape[1]), measure, separate)
+        return PairDistances(bounds, measure, separate)
 
     def shape_distances(self) -> list[Array]:
         """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
@@ -206,7 +206,7 @@ class PathWorld:
         bodies = self._placed_bodies()
         return self._once("self", lambda: bodies.between(bodies.among_links))
 
-    def _once(self, what: str | int, make: Callable[[], PairDistances]) -> PairDistances:
+    def _once(self, what: str, make: Callable[[], PairDistances]) -> PairDistances:
         """Return what was made since the robot moved, or make it."""
         if what not in self._pairs:
             self._pairs[what] = make()
@@ -229,11 +229,16 @@ class PathWorld:
         Returns:
             Shape (n,).
         """
+        return self._trace.reach(self._spread, furthest)
+
+    @cached_property
+    def _spread(self) -> Array:
+        """How far from the origins of the base and of every joint what they move reaches [m], shape (n + 1,)."""
         bodies = self._bodies
         spread = np.array([bodies.spread(joint) if bodies else 0.0 for joint in range(self.robot.n + 1)])
         held = 0.0 if self._object_size is None else np.linalg.norm(self._object_size) / 2
         spread[self._carrier] = max(spread[self._carrier], np.linalg.norm(self._offset) + held)
-        return self._trace.reach(spread, furthest)
+        return spread
 
     def _placed_bodies(self) -> Bodies:
         """Return the robot's shape where the robot is."""
@@ -254,40 +259,26 @@ class PathWorld:
             RecipeError: The problem has no object.
         """
         if self._object_distances is None:
-            self._require_object()
-            pairs = self._object_from_each()
-            found = [each.smallest()[0] for each in pairs] if self._is_somewhere() else self._unknown(len(pairs))
+            pairs = self.object_pairs()
+            found = pairs.smallest_of_each() if self._is_somewhere() else self._unknown(len(pairs.bounds))
             self._object_distances = found
         return self._object_distances
 
     def object_pairs(self) -> PairDistances:
         """Tell the signed distances of the held object from every obstacle."""
-        pairs = self._object_from_each()
-        bounds = np.concatenate([np.empty((0, self.q.shape[1])), *(each.bounds for each in pairs)])
+        return self._once("object", self._from_object)
+
+    def _from_object(self) -> PairDistances:
+        position, rotation = self.tip_position, self.tip_rotation
+        size, solids = self._require_object(), self._solids
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
-            return pairs[pair].measure(0, k)
+            return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), pair)
 
         def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
-            return pairs[pair].separate(0, direction, which)
+            return cuboid_separation(position[:, which], rotation[..., which], size, solids[pair], direction)
 
-        return PairDistances(bounds, measure, separate, {i: each.known.get(0, []) for i, each in enumerate(pairs)})
-
-    def _object_from_each(self) -> list[PairDistances]:
-        return [self._once(index, partial(self._from_object, index)) for index in range(len(self._solids))]
-
-    def _from_object(self, index: int) -> PairDistances:
-        """Tell the signed distances of the held object from one obstacle."""
-        position, rotation = self.tip_position, self.tip_rotation
-        size, solid = self._require_object(), self._solids[index]
-
-        def measure(_: int, k: int) -> tuple[float, Array]:
-            return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), index)
-
-        def separate(_: int, direction: Array, which: Which = slice(None), /) -> Array:
-            return cuboid_separation(position[:, which], rotation[..., which], size, solid, direction)
-
-        return PairDistances(cuboid_gaps(position, rotation, size, solid)[None], measure, separate)
+        return PairDistances(cuboid_gaps(position, rotation, size, solids), measure, separate)
 
     def _require_object(self) -> Array:
         """Return the object's edge lengths [m], shape (3,)."""

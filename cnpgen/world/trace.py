@@ -31,7 +31,8 @@ class Trace:
         self._model, self._data = model, model.createData()
         self._parents = list(model.parents)[1:]
         self._parts = [_parts(model, joint) for joint in range(1, model.njoints)]
-        self._slides = [bool(parts[_SLIDE].any()) for parts in self._parts]
+        self._lengths = np.array([np.linalg.norm(parts[[_ORIGIN, _SLIDE], :3], axis=1) for parts in self._parts])
+        self._slides = self._lengths[:, 1] > 0
 
     def poses(self, q: Array) -> tuple[Array, Array]:
         """Compute the poses of all joints at K states.
@@ -72,8 +73,7 @@ class Trace:
         Returns:
             Shape (n,): the length of the way to the furthest point; 1 for joints that slide.
         """
-        sizes = [np.linalg.norm(parts[[_ORIGIN, _SLIDE], :3], axis=1) for parts in self._parts]
-        lengths = np.array([offset + slide * q for (offset, slide), q in zip(sizes, furthest, strict=True)])
+        lengths = self._lengths[:, 0] + self._lengths[:, 1] * furthest
         found = spread[1:].copy()
         for joint in range(len(found), 1, -1):
             found[joint - 2] = max(found[joint - 2], lengths[joint - 1] + found[joint - 1])

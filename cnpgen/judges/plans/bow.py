@@ -35,5 +35,5 @@ def bows(motion: Motion, s: Array, reach: Array) -> Array:
     before = np.cumsum(first, axis=1) - first
     bent = (second + first * (first + 2 * before)) @ reach
     low, high = np.searchsorted(edges[1:-1], s[:-1], "right"), np.searchsorted(edges[1:-1], s[1:], "left")
-    step = np.maximum(np.diff(s), 0.0)
+    step = np.maximum(s[1:] - s[:-1], 0.0)
     return np.asarray(step**2 / 8 * np.maximum(bent[low], bent[high]))
