@@ -48,7 +48,9 @@ class Trace:
             MachineError: They are not what Pinocchio says.
         """
         count = q.shape[1]
-        turns = np.stack([np.sin(q), np.cos(q)], axis=1)
+        turns = np.empty((len(q), 2, count))
+        np.sin(q, out=turns[:, 0])
+        np.cos(q, out=turns[:, 1])
         turns[self._slides, 0] = q[self._slides]
         frames = np.empty((len(q) + 1, 4, 3, count))  # of every joint its x, y and z axis and its origin in the world
         frames[0] = np.eye(4, 3)[..., None]
@@ -59,9 +61,8 @@ class Trace:
             moved *= turns[joint - 1, :, None, None]
             np.add(still, moved[0], out=frames[joint])
             frames[joint] += moved[1]
-        rotations, origins = frames[:, :3].swapaxes(1, 2), frames[:, 3]
-        self._check(q, rotations, origins)
-        return rotations, origins
+        self._check(q, frames)
+        return frames[:, :3].swapaxes(1, 2), frames[:, 3]
 
     def reach(self, spread: Array, furthest: Array) -> Array:
         """Bound how far a unit of each joint's speed moves any point of what it carries, seen from before it [m].
@@ -81,17 +82,13 @@ class Trace:
             found[:] = lengths.sum() + 2 * spread.max()
         return np.where(self._slides, 1.0, found)
 
-    def _check(self, q: Array, rotations: Array, positions: Array) -> None:
+    def _check(self, q: Array, frames: Array) -> None:
         """Compare the first, the middle and the last state with Pinocchio's."""
         looked = [0, q.shape[1] // 2, -1]
-        states = q[:, looked].T.copy()
-        poses = np.array([self._tell(state) for state in states])
-        found = np.concatenate([rotations[-1][..., looked], positions[-1][:, None, looked]], axis=1)
-        off = np.abs(poses - found.transpose(2, 0, 1)).max(axis=(1, 2))
-        far = off > VOUCHED * (1 + np.abs(states).max(axis=1))
-        if far.any():
-            k = int(far.argmax())
-            raise MachineError(f"forward kinematics differ from Pinocchio's by {off[k]:.2g} at {states[k].tolist()}")
+        states, poses = q[:, looked].T.copy(), frames[-1][..., looked]
+        off = float(np.abs(poses - np.array([self._tell(state) for state in states]).T).max())
+        if off > VOUCHED * (1 + np.abs(states).max()):
+            raise MachineError(f"forward kinematics differ from Pinocchio's by {off:.2g} near {states[0].tolist()}")
 
     def _tell(self, state: Array) -> Array:
         """Return the last joint's pose as Pinocchio says it, shape (3, 4)."""

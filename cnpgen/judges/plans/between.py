@@ -23,7 +23,7 @@ Peak = tuple[float, int, float]  # value, of which function, at which phase
 
 CLOSE = 1e-6  # how far below the largest value the one that is found may be, where that decides whether it is above 1
 ROUGH = 1e-2  # the same elsewhere
-HALVINGS = 40  # at most: pieces are then shorter than a picosecond
+DIVISIONS = 40  # at most: pieces are then shorter than a picosecond
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> Pieces:
     return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq, jerk=third)
 
 
-def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least: float = -np.inf) -> Peak:
+def largest(
+    rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least: float = -np.inf, parts: int = 2
+) -> Peak:
     """Find the largest value of piecewise polynomials to within ``ROUGH``, and whether it is above 1 to ``CLOSE``.
 
     Args:
@@ -68,29 +70,30 @@ def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least
         edges: Phases between which they are polynomials, shape (S + 1,).
         known: A value that is attained, as returned.
         least: What is proven to be no larger than this, at most 1, is not looked into.
+        parts: How many parts a piece is divided into at a time, a power of 2.
 
     Returns:
         ``(value, row, s)``: the largest value that is attained, of which function, at which phase.
     """
     best, *at = known
-    span, of_row = np.nonzero(rows.max(axis=0) > _worth_halving(best, least))
+    span, of_row = (rows.max(axis=0) > _worth_dividing(best, least)).nonzero()
     pieces, left, width = rows[:, span, of_row], edges[span], (edges[1:] - edges[:-1])[span]
-    for _ in range(HALVINGS):
+    for _ in range(DIVISIONS):
         if not len(span):
             break
-        pieces = (_halving(len(rows)) @ pieces).reshape(len(rows), -1)
-        width, of_row = np.concatenate([width, width]) / 2, np.concatenate([of_row, of_row])
-        left = np.concatenate([left, left + width[: len(left)]])
+        pieces = (_dividing(len(rows), parts) @ pieces).reshape(len(rows), -1)
+        left = np.concatenate([left + k / parts * width for k in range(parts)])
+        width, of_row = np.concatenate([width / parts] * parts), np.concatenate([of_row] * parts)
         for values, s in ((pieces[0], left), (pieces[-1], left + width)):
             top = int(values.argmax())
             if values[top] > best:
                 best, *at = float(values[top]), int(of_row[top]), float(s[top])
-        (span,) = np.nonzero(pieces.max(axis=0) > _worth_halving(best, least))
+        (span,) = (pieces.max(axis=0) > _worth_dividing(best, least)).nonzero()
         pieces, of_row, left, width = pieces[:, span], of_row[span], left[span], width[span]
     return best, int(at[0]), at[1]
 
 
-def _worth_halving(best: float, least: float) -> float:
+def _worth_dividing(best: float, least: float) -> float:
     """Return what the largest coefficient of a piece is above if it could hide more than is known."""
     return max(least, best + ROUGH if best > 1 else min(best + ROUGH, max(1.0, best + CLOSE)))
 
@@ -173,10 +176,13 @@ def _products(i: int, j: int) -> Array:
 
 
 @cache
-def _halving(size: int) -> Array:
-    """Return de Casteljau's matrix at the middle, shape (2 d + 2, d + 1).
+def _dividing(size: int, parts: int) -> Array:
+    """Return de Casteljau's matrix for parts of equal length, a power of 2, shape (parts (d + 1), d + 1).
 
-    It turns coefficients into the first ones of both halves, then the second ones of both, and so on.
+    It turns coefficients into the first ones of all parts, then the second ones of all, and so on.
     """
     first = np.array([[comb(k, m) / 2**k for m in range(size)] for k in range(size)])
-    return np.stack([first, first[::-1, ::-1]], axis=1).reshape(-1, size)
+    found = [np.eye(size)]
+    while len(found) < parts:
+        found = [half @ each for each in found for half in (first, first[::-1, ::-1])]
+    return np.stack(found, axis=1).reshape(-1, size)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 LEAST = 1e-9  # of a bound: how exactly the largest excess is found where none is allowed
+AT_ONCE = 8  # parts that a brief look divides pieces into at a time
 _QUANTITIES = {JointPosition: "q", JointVelocity: "dq", JointAcceleration: "ddq", JointJerk: "jerk"}
 
 
@@ -87,8 +88,10 @@ class Limit:
         hull = self._beyond(coefficients.min(axis=0).min(axis=0), coefficients.max(axis=0).max(axis=0))
         if brief and hull.max() <= 1:
             return known
-        least = 1.0 if brief else -np.inf
-        return largest(self._beyond(coefficients, coefficients), pieces.edges, known, least=least)
+        rows = self._beyond(coefficients, coefficients)
+        if brief:
+            return largest(rows, pieces.edges, known, least=1.0, parts=AT_ONCE)
+        return largest(rows, pieces.edges, known)
 
     def _beyond(self, least: Array, most: Array) -> Array:
         """Return how far ``least`` is below lower bounds, then ``most`` above upper ones, shape (..., 2 n)."""

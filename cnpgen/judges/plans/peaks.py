@@ -59,6 +59,8 @@ class _Rows:
         least = np.where(largest <= 1, np.minimum(least, 1 + CLOSE), least)
         tops = _tops(self.s, self.share)
         row, k = (tops > least[self.of, None]).nonzero()
+        if not len(row):
+            return row, row, np.empty((0, 2))
         chosen = np.argsort(-tops[row, k], kind="stable")[:MOST]
         row, k = row[chosen], k[chosen]
         phases = np.broadcast_to(self.s, self.share.shape)

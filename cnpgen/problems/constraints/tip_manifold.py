@@ -98,7 +98,7 @@ class TipManifold(Constraint):
         """Let a motion that starts off the manifold reach it: ``start_off`` until s = 0.1, nothing from s = 0.3 on."""
         if condition.name != self.held_name:
             return super().funnel(condition, s, start_tip)
-        open_: Array = np.clip((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0, 1.0)
+        open_: Array = np.minimum(np.maximum((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0), 1.0)
         return self.start_off(start_tip)[..., None] * open_
 
     def start_off(self, start_tip: Array) -> Array:
