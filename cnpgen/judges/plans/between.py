@@ -51,13 +51,14 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> Pieces:
     edges = _edges(len(path), len(rate), degree)
     p, p1, p2, *p3 = in_bernstein_form(path, degree, range(3 + jerk), edges)
     r, r1, *r2 = in_bernstein_form(rate, degree, range(2 + jerk), edges)
-    r_r, r1_r = _product(r, r), _product(r1, r)
+    first, r_r = _product(np.concatenate([p1, r1], axis=2), r), _product(r, r)
+    dq, r1_r = first[..., :-1], first[..., -1:]
     ddq = _product(p2, r_r) + _product(p1, r1_r)
     if not jerk:
-        return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq)
+        return Pieces(edges, q=p, dq=dq, ddq=ddq)
     bends = _product(p3[0], _product(r_r, r)) + _product(p2, 3 * _product(r1_r, r))
     third = bends + _product(p1, _product(_product(r2[0], r) + _product(r1, r1), r))
-    return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq, jerk=third)
+    return Pieces(edges, q=p, dq=dq, ddq=ddq, jerk=third)
 
 
 def largest(

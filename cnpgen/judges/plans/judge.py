@@ -4,7 +4,6 @@ With what optimised them it shares the problem, with its bounds, tolerances and 
 control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or distances, and no transcription.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
@@ -16,7 +15,7 @@ from cnpgen.errors import UsageError
 from cnpgen.judges.plans.between import knots, polynomials
 from cnpgen.judges.plans.closer import look_closer
 from cnpgen.judges.plans.course import Course, Phases, course, course_at, jerks
-from cnpgen.judges.plans.limits import Limit, limits_of
+from cnpgen.judges.plans.limits import Limits, limits_of
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
@@ -191,9 +190,7 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
             raise UsageError(f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {found}")
 
 
-def _judge_plan(
-    plan: _Plan, world: PathWorld, limits: Sequence[Limit], step: float, *, brief: bool
-) -> Verdict:
+def _judge_plan(plan: _Plan, world: PathWorld, limits: Limits, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
     if fault := _fault(plan):
         return Verdict(fault)
@@ -215,16 +212,19 @@ def _judge_plan(
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
-def _margins(survey: Survey, limits: Sequence[Limit], *, brief: bool) -> list[Margin]:
+def _margins(survey: Survey, limits: Limits, *, brief: bool) -> list[Margin]:
     """Measure every constraint, at the samples and between them; the survey's world is moved."""
     pieces, s, table = polynomials(survey.motion, jerk=survey.problem.uses_jerk), survey.samples.s, survey.table
-    margins = [(each.constraint, each.margin(survey.world, pieces, s, table, brief=brief)) for each in limits]
+    proven = limits.margins(survey.world, pieces, s, table, brief=brief)
     worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
     for each, margin in chain(look_closer(survey, brief=brief), look_at_peaks(survey)):
         worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
-    margins += [(each.constraint, worst[id(each)]) for each in survey.measured]
-    order = {id(constraint): k for k, constraint in enumerate(survey.problem.constraint)}
-    return [margin for _, margin in sorted(margins, key=lambda each: order[id(each[0])])]
+    found: dict[int, list[Margin]] = {id(constraint): [] for constraint in survey.problem.constraint}
+    for constraint, margin in zip(limits.constraints, proven, strict=True):
+        found[id(constraint)].append(margin)
+    for each in survey.measured:
+        found[id(each.constraint)].append(worst[id(each)])
+    return [*chain.from_iterable(found.values())]
 
 
 def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
@@ -263,7 +263,8 @@ def _fault(plan: _Plan) -> Reason | None:
     """Say why a plan cannot be evaluated, if it cannot."""
     if not plan.is_finite():
         return Reason.NOT_FINITE
-    return None if plan.motion.runs_forward()[0] else Reason.RATE
+    forward = plan.motion.rate.min() > 0 or plan.motion.runs_forward()[0]  # r is between its control points
+    return None if forward else Reason.RATE
 
 
 def reason_of(margins: list[Margin]) -> str:

@@ -74,7 +74,7 @@ def look_at_peaks(survey: Survey) -> Iterator[tuple[Measured, Margin]]:
         survey: A motion; its world is moved.
     """
     smooth = [each for each in survey.measured if not is_contact(each.constraint)]
-    largest = np.array([np.max(each.share, initial=-np.inf) for each in smooth])
+    largest = np.array([each.share.max() for each in smooth])
     rows = _first(survey.samples.s, smooth)
     for _ in range(ROUNDS):
         of, part, ends = rows.promising(largest)

@@ -118,8 +118,8 @@ def _phases(evenly: int, at_ends: int, also: Collection[float]) -> Array:
     return np.concatenate([np.linspace(0, 1, evenly + 1), near, 1 - near, list(also)])
 
 
-def times(s: Array | float, table: Array) -> Array:
-    """Return when a motion is at one phase s, or at K of them [s]; ``table`` is what ``time_table`` returned."""
+def times(s: Array, table: Array) -> Array:
+    """Return when a motion is at phases s [s], shape (K,); ``table`` is what ``time_table`` returned."""
     return np.interp(s, *table)
 
 

@@ -8,7 +8,7 @@ table).
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -109,8 +109,8 @@ class TipManifold(Constraint):
         """
         place = self.place
         pairs = zip(place.held, place.height, strict=True)
-        off = np.stack([np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
-        return np.asarray(np.minimum(off.max(axis=0), self.band))
+        off = reduce(np.maximum, [np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
+        return np.asarray(np.minimum(off, self.band))
 
     def _position(self, tip: Sequence[Any], band: float) -> tuple[Condition, ...]:
         place = self.place
