@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from cnpgen.world.state import World
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 LEAST = 1e-9  # of a bound: how exactly the largest excess is found where none is allowed
 AT_ONCE = 8  # parts that a brief look divides pieces into at a time
@@ -33,28 +34,24 @@ def is_proven(constraint: Constraint) -> bool:
 
 @dataclass(frozen=True)
 class Limits:
-    """L limits of n joints that are proven to hold, or broken; arrays have shape (L, n).
+    """L limits of n joints that are proven to hold, or broken.
 
     Attributes:
         constraints: Those of a problem that are proven.
         conditions: What each of them states, at whatever state.
         joints: Names of the joints.
-        lower: Lower bounds.
-        upper: Upper bounds.
-        allowed: How far beyond them a motion may be and still be called valid.
+        allowed: How far beyond its bounds a motion may be and still be called valid, shape (L, n).
+        bounds: Lower bounds of all joints, then upper ones, shape (L, 2 n).
+        scale: What is counted in how far a motion is beyond them: what is allowed, or a little where that is nothing;
+            negative of lower bounds, since what is less is beyond them. Shape (L, 2 n).
     """
 
     constraints: tuple[Constraint, ...]
     conditions: tuple[Condition, ...]
     joints: tuple[str, ...]
-    lower: Array
-    upper: Array
     allowed: Array
-
-    @cached_property
-    def scale(self) -> Array:
-        """What is counted in how far a motion is beyond them: what is allowed, or a little where that is nothing."""
-        return np.maximum(self.allowed, LEAST * np.maximum(np.abs(self.lower), np.abs(self.upper)))
+    bounds: Array
+    scale: Array
 
     @cached_property
     def tolerant(self) -> NDArray[np.bool_]:
@@ -75,12 +72,12 @@ class Limits:
             return []
         names = [_QUANTITIES[type(each)] for each in self.constraints]
         functions = [getattr(pieces, name) for name in names]
-        peaks = self._at_samples(np.array([getattr(world, name) for name in names]), s)
+        peaks, hulls = self._at_samples(np.array([getattr(world, name) for name in names]), s), self._hulls(functions)
         briefly = self.tolerant & brief
-        for limit in np.flatnonzero(~(briefly & self._hold(functions))).tolist():
-            rows, known = self._beyond(functions[limit], functions[limit], limit), peaks[limit]
-            least, parts = (1.0, AT_ONCE) if briefly[limit] else (-np.inf, 2)
-            peaks[limit] = largest(rows, pieces.edges, known, least=least, parts=parts)
+        for limit in np.flatnonzero(~briefly | ~(hulls.max(axis=1) <= 1)).tolist():
+            least = 1.0 if briefly[limit] else -np.inf
+            (rows,) = (hulls[limit] > least).nonzero()
+            peaks[limit] = self._largest(limit, rows, functions[limit], pieces.edges, peaks[limit], least)
         when = times(np.array([phase for *_, phase in peaks]), table).tolist()
         return [self._margin(limit, peak, when[limit]) for limit, peak in enumerate(peaks)]
 
@@ -93,29 +90,36 @@ class Limits:
             peaks.append((float(shares[limit, row]), row, float(s[its.argmin() if below else its.argmax()])))
         return peaks
 
-    def _hold(self, functions: list[Array]) -> NDArray[np.bool_]:
-        """Say which limits functions hold with certainty, by their coefficients of shape (d + 1, S, n); shape (L,)."""
+    def _hulls(self, functions: list[Array]) -> Array:
+        """Bound by how many ``scale`` functions are beyond each bound; they are coefficients, shape (d + 1, S, n)."""
         least = np.array([each.min(axis=0).min(axis=0) for each in functions])
         most = np.array([each.max(axis=0).max(axis=0) for each in functions])
-        return np.asarray(self._beyond(least, most).max(axis=1) <= 1)
+        return self._beyond(least, most)
 
-    def _beyond(self, least: Array, most: Array, limit: "int | slice" = slice(None)) -> Array:
-        """Return how far ``least`` is below lower bounds, then ``most`` above upper ones, shape (..., 2 n)."""
-        scale, below, above = self.scale[limit], self.lower[limit] - least, most - self.upper[limit]
-        return np.concatenate([below / scale, above / scale], axis=-1)
+    def _beyond(self, least: Array, most: Array) -> Array:
+        """Return by how many ``scale`` least and largest values, shape (L, n), are beyond bounds, shape (L, 2 n)."""
+        return np.asarray((np.concatenate([least, most], axis=1) - self.bounds) / self.scale)
+
+    def _largest(  # noqa: PLR0917 - what is looked for, where, and what is known
+        self, limit: int, rows: Indices, function: Array, edges: Array, known: Peak, least: float
+    ) -> Peak:
+        """Look for more than is known at some of the bounds of a limit."""
+        values = function[..., rows % len(self.joints)]
+        beyond, parts = (values - self.bounds[limit, rows]) / self.scale[limit, rows], AT_ONCE if least == 1 else 2
+        share, found, phase = largest(beyond, edges, (known[0], -1, known[2]), least=least, parts=parts)
+        return share, known[1] if found < 0 else int(rows[found]), phase
 
     def _margin(self, limit: int, peak: Peak, time: float) -> Margin:
-        share, row, phase = peak
-        low, part = row < len(self.joints), row % len(self.joints)
-        excess, bound = share * self.scale[limit, part], (self.lower if low else self.upper)[limit, part]
+        (share, row, phase), condition = peak, self.conditions[limit]
+        bound, beyond, part = self.bounds[limit, row], share * self.scale[limit, row], row % len(self.joints)
         return Margin(
-            self.conditions[limit].name,
+            condition.name,
             self.constraints[limit].reason,
-            unit_of(self.conditions[limit].unit, part),
+            unit_of(condition.unit, part),
             self.joints[part],
-            value=float(bound - excess if low else bound + excess),
+            value=float(bound + beyond),
             bound=float(bound),
-            excess=float(excess),
+            excess=float(-beyond if row < len(self.joints) else beyond),
             allowed=float(self.allowed[limit, part]),
             time=time,
             phase=phase,
@@ -131,8 +135,10 @@ def limits_of(problem: Problem, world: PathWorld) -> Limits:
     """
     constraints = tuple(each for each in problem.constraint if is_proven(each))
     conditions = tuple(each.measured(cast("World", world))[0] for each in constraints)
-    stated = [
-        (found.lower, found.upper, each.allowed(found)) for each, found in zip(constraints, conditions, strict=True)
-    ]
-    bounds = np.array(stated).reshape(-1, 3, world.robot.n).swapaxes(0, 1)
-    return Limits(constraints, conditions, world.robot.joint_names, *bounds)
+    shape = len(constraints), world.robot.n
+    lower, upper = (np.array([getattr(each, end) for each in conditions]).reshape(shape) for end in ("lower", "upper"))
+    pairs = zip(constraints, conditions, strict=True)
+    allowed = np.array([each.allowed(condition) for each, condition in pairs]).reshape(shape)
+    scale = np.maximum(allowed, LEAST * np.maximum(np.abs(lower), np.abs(upper)))
+    both = np.concatenate([lower, upper], axis=1), np.concatenate([-scale, scale], axis=1)
+    return Limits(constraints, conditions, world.robot.joint_names, allowed, *both)
