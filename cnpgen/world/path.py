@@ -71,7 +71,9 @@ class PathWorld:
         rest = np.zeros((robot.n, 1))
         self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
 
-    def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
+    def set_path(
+        self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None, *, exact: bool = True
+    ) -> None:
         """Move to K states.
 
         Args:
@@ -80,14 +82,14 @@ class PathWorld:
             ddq: Joint accelerations [rad/s^2], shape (n, K).
             tops: The numbers of the obstacles (``cnpgen.robots.solid``).
             jerk: Joint jerks [rad/s^3], shape (n, K), if they are wanted.
+            exact: Whether the smallest distance is wanted exactly, too, where all are ``enough``.
         """
-        self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
+        self.q, self.dq, self.ddq, self.jerk, self._exact = q, dq, ddq, jerk, exact
         self._placed = False
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
         self._pairs: dict[str, PairDistances] = {}
-        self._object_distances: list[Array] | None = None
         self._solids = solids_of(self.obstacles, tops)
         self._scene.place(self._solids)
         self._move()
@@ -151,14 +153,16 @@ class PathWorld:
         velocity = np.array(pin.getFrameVelocity(model, data, tip, frame).linear)
         return velocity, np.array(pin.getFrameClassicalAcceleration(model, data, tip, frame).linear)
 
-    def segment_distances(self) -> list[Array]:
+    def segment_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of every segment of the robot's skeleton from every obstacle, one by one [m].
+
+        Args:
+            enough: What is at least as far away need not be measured, if the path is not to be exact [m].
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
         """
-        pairs = self.segment_pairs()
-        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+        return self._smallest(self.segment_pairs(), enough)
 
     def segment_pairs(self) -> PairDistances:
         """Tell the signed distances of every segment of the robot's skeleton from every obstacle, one by one."""
@@ -179,8 +183,11 @@ class PathWorld:
 
         return PairDistances(bounds, measure, separate)
 
-    def shape_distances(self) -> list[Array]:
+    def shape_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
+
+        Args:
+            enough: As of ``segment_distances``.
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
@@ -188,23 +195,29 @@ class PathWorld:
         Raises:
             RecipeError: The robot has no shape.
         """
-        pairs = self.shape_pairs()
-        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+        return self._smallest(self.shape_pairs(), enough)
 
     def shape_pairs(self) -> PairDistances:
         """Tell the signed distances of every moving piece of the robot's shape from every obstacle, one by one."""
         bodies = self._placed_bodies()
         return self._once("shape", lambda: bodies.between(bodies.from_obstacles))
 
-    def self_distances(self) -> list[Array]:
+    def self_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
-        pairs = self.self_pairs()
-        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+        return self._smallest(self.self_pairs(), enough)
 
     def self_pairs(self) -> PairDistances:
         """Tell the signed distances of every two pieces of the robot's shape that must not touch."""
         bodies = self._placed_bodies()
         return self._once("self", lambda: bodies.between(bodies.among_links))
+
+    def _smallest(self, pairs: PairDistances, enough: float, *, of_each: bool = False) -> list[Array]:
+        """Measure distances of which the smallest, or that of each pair, is exact if it is to be, or not enough."""
+        if not self._is_somewhere():
+            return [np.full(self.q.shape[1], np.nan) for _ in pairs.bounds]
+        if not self._exact and (pairs.bounds >= enough).all():
+            return list(pairs.bounds)
+        return pairs.smallest_of_each() if of_each else pairs.smallest()
 
     def _once(self, what: str, make: Callable[[], PairDistances]) -> PairDistances:
         """Return what was made since the robot moved, or make it."""
@@ -249,8 +262,11 @@ class PathWorld:
             self._placed = True
         return self._bodies
 
-    def object_distances(self) -> list[Array]:
+    def object_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
+
+        Args:
+            enough: As of ``segment_distances``.
 
         Returns:
             Arrays of shape (K,), of each of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
@@ -258,11 +274,7 @@ class PathWorld:
         Raises:
             RecipeError: The problem has no object.
         """
-        if self._object_distances is None:
-            pairs = self.object_pairs()
-            found = pairs.smallest_of_each() if self._is_somewhere() else self._unknown(len(pairs.bounds))
-            self._object_distances = found
-        return self._object_distances
+        return self._smallest(self.object_pairs(), enough, of_each=True)
 
     def object_pairs(self) -> PairDistances:
         """Tell the signed distances of the held object from every obstacle."""
@@ -308,6 +320,3 @@ class PathWorld:
 
     def _is_somewhere(self) -> bool:
         return bool(np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all())
-
-    def _unknown(self, count: int) -> list[Array]:
-        return [np.full(self.q.shape[1], np.nan) for _ in range(count)]

@@ -201,7 +201,7 @@ def _judge_plan(plan: _Plan, world: PathWorld, limits: Limits, step: float, *, b
     states, samples = found
     if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk, exact=not brief)
     ends = boundary_margins(states, plan.boundary, samples, world.robot)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
@@ -235,7 +235,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     states = course_at(plan.motion, _GLANCE, jerk=plan.problem.uses_jerk)
     if not states.is_finite():
         return True
-    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk, exact=False)
     start_tip = world.tip_position[:, 0]
     found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
     if not all((each.share <= 1).all() for each in found):
