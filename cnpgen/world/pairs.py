@@ -87,7 +87,8 @@ class PairDistances:
                 for end in (k, k + 1):
                     if not hulls[pair, k] >= 0:
                         self._raise(hulls[pair], pair, self._measured(pair, end)[1], least[pair] + bows)
-        return np.where(np.isnan(hulls), -np.inf, hulls).min(axis=0, initial=np.inf)
+        lowest: Array = np.where(np.isnan(hulls), -np.inf, hulls).min(axis=0, initial=np.inf)
+        return lowest
 
     def _raise(self, hull: Array, pair: int, direction: Array, wanted: Array) -> None:
         """Raise bounds of a pair, shape (K - 1,), where they are below 0, by a direction."""

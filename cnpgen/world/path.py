@@ -82,7 +82,7 @@ class PathWorld:
             ddq: Joint accelerations [rad/s^2], shape (n, K).
             tops: The numbers of the obstacles (``cnpgen.robots.solid``).
             jerk: Joint jerks [rad/s^3], shape (n, K), if they are wanted.
-            exact: Whether the smallest distance is wanted exactly, too, where all are ``enough``.
+            exact: Whether the smallest distance is to be exact even where bounds show that all of them are enough.
         """
         self.q, self.dq, self.ddq, self.jerk, self._exact = q, dq, ddq, jerk, exact
         self._placed = False
@@ -103,7 +103,8 @@ class PathWorld:
 
     def _axes_of_tip(self) -> Array:
         """Return the axes of the joint that carries the tip, all their components and states in a row, (3, 3 K)."""
-        return self._rotations[self._carrier].swapaxes(0, 1).reshape(3, -1)
+        axes: Array = self._rotations[self._carrier].swapaxes(0, 1)
+        return axes.reshape(3, -1)
 
     @property
     def tip_rotation(self) -> Array:
@@ -157,7 +158,7 @@ class PathWorld:
         """Measure the signed distance of every segment of the robot's skeleton from every obstacle, one by one [m].
 
         Args:
-            enough: What is at least as far away need not be measured, if the path is not to be exact [m].
+            enough: If all are at least this, bounds of them that show it do where the path is not exact [m].
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
