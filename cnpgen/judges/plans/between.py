@@ -77,13 +77,14 @@ def largest(
         ``(value, row, s)``: the largest value that is attained, of which function, at which phase.
     """
     best, *at = known
+    starts = np.arange(parts)[:, None] / parts
     span, of_row = (rows.max(axis=0) > _worth_dividing(best, least)).nonzero()
     pieces, left, width = rows[:, span, of_row], edges[span], (edges[1:] - edges[:-1])[span]
     for _ in range(DIVISIONS):
         if not len(span):
             break
         pieces = (_dividing(len(rows), parts) @ pieces).reshape(len(rows), -1)
-        left = np.concatenate([left + k / parts * width for k in range(parts)])
+        left = (left + starts * width).ravel()
         width, of_row = np.concatenate([width / parts] * parts), np.concatenate([of_row] * parts)
         for values, s in ((pieces[0], left), (pieces[-1], left + width)):
             top = int(values.argmax())

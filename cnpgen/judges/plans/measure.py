@@ -49,10 +49,9 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot
     """
     margins = []
     for what, (name, unit, allowed) in BOUNDARY.items():
-        conditions = getattr(boundary, f"start_{what}"), getattr(boundary, f"goal_{what}")
-        ends = [k for k, wanted in zip((0, -1), conditions, strict=True) if wanted is not None]
-        wanted = np.concatenate([each for each in conditions if each is not None])
-        found = getattr(states, what).T[ends]
+        start, goal = getattr(boundary, f"start_{what}"), getattr(boundary, f"goal_{what}")
+        wanted = start if goal is None else np.concatenate([start, goal])
+        found = getattr(states, what).T[:: len(samples.s) - 1][: len(wanted)]  # at the start, and at the goal
         error = np.abs(found - wanted)
         end, joint = divmod(int(error.argmax()), error.shape[1])
         margins.append(
@@ -65,8 +64,8 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot
                 bound=float(wanted[end, joint]),
                 excess=float(error[end, joint]),
                 allowed=allowed,
-                time=float(samples.t[ends[end]]),
-                phase=float(samples.s[ends[end]]),
+                time=float(samples.t[-end]),
+                phase=float(samples.s[-end]),
             )
         )
     return margins
