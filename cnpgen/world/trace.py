@@ -88,7 +88,7 @@ class Trace:
         states, poses = q[:, looked].T.copy(), frames[-1][..., looked]
         off = float(np.abs(poses - np.array([self._tell(state) for state in states]).T).max())
         if off > VOUCHED * (1 + np.abs(states).max()):
-            raise MachineError(f"forward kinematics differ from Pinocchio's by {off:.2g} near {states[0].tolist()}")
+            raise MachineError(f"forward kinematics differ from Pinocchio's by {off:.2g} at one of {states.tolist()}")
 
     def _tell(self, state: Array) -> Array:
         """Return the last joint's pose as Pinocchio says it, shape (3, 4)."""

@@ -24,11 +24,12 @@ def test_polynomials_are_the_motion(label: str) -> None:
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
 @pytest.mark.parametrize("seed", range(5))
-def test_the_largest_value_is_that_of_a_very_fine_grid(label: str, seed: int) -> None:
+@pytest.mark.parametrize("parts", [2, 8])
+def test_the_largest_value_is_that_of_a_very_fine_grid(label: str, parts: int, seed: int) -> None:
     pieces = polynomials(bent(load(label), 0.05, seed=seed).motion, jerk=True)
     values = pieces.ddq if seed % 2 else pieces.jerk
     rows = values / np.abs(values).max() * 3
-    found, row, s = largest(rows, pieces.edges)
+    found, row, s = largest(rows, pieces.edges, parts=parts)
     grid = value(rows, pieces.edges, np.linspace(0, 1, 20001))
     assert grid.max() - ROUGH <= found <= grid.max() + 1e-5  # the grid's own gaps
     assert row == np.argmax(grid.max(axis=1))
@@ -44,11 +45,12 @@ def test_a_peak_between_any_two_moments_of_a_grid_is_found() -> None:
 
 
 @pytest.mark.parametrize("least", [-np.inf, 1.0])
+@pytest.mark.parametrize("parts", [2, 8])
 @pytest.mark.parametrize("top", [1 + 2 * CLOSE, 1 - 1e-9])
-def test_whether_a_peak_is_above_1_is_known_exactly(top: float, least: float) -> None:
+def test_whether_a_peak_is_above_1_is_known_exactly(top: float, parts: int, least: float) -> None:
     at = 1 / np.pi
     rows = np.reshape([top - at**2, top - at**2 + at, top - (1 - at) ** 2], (3, 1, 1))
-    found, _, _ = largest(rows, np.array([0.0, 1.0]), least=least)
+    found, _, _ = largest(rows, np.array([0.0, 1.0]), least=least, parts=parts)
     assert found <= top
     assert found >= top - CLOSE or top <= least
     assert (found > 1) == (top > 1)

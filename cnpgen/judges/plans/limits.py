@@ -76,7 +76,7 @@ class Limits:
         briefly = self.tolerant & brief
         for limit in np.flatnonzero(~briefly | ~(hulls.max(axis=1) <= 1)).tolist():
             least = 1.0 if briefly[limit] else -np.inf
-            (rows,) = (hulls[limit] > least).nonzero()
+            (rows,) = (~(hulls[limit] <= least)).nonzero()
             peaks[limit] = self._largest(limit, rows, functions[limit], pieces.edges, peaks[limit], least)
         when = times(np.array([phase for *_, phase in peaks]), table).tolist()
         return [self._margin(limit, peak, when[limit]) for limit, peak in enumerate(peaks)]
