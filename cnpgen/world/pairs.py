@@ -37,9 +37,21 @@ class PairDistances:
 
     def smallest(self) -> list[Array]:
         """Measure distances [m]: arrays of shape (K,), of which the smallest value is exact; see ``sweep``."""
-        if self.bounds.shape[1] == 1:  # it is measured already when its direction is known
-            return list(sweep(self.bounds, self.measure, lambda pair, _: self.bounds[pair]))
-        return list(sweep(self.bounds, self._measured, self.separate))
+        return self._swept(list(range(len(self.bounds))))
+
+    def smallest_of_each(self) -> list[Array]:
+        """Measure likewise, but so that the smallest value of every array is exact."""
+        return [self._swept([pair])[0] for pair in range(len(self.bounds))]
+
+    def _swept(self, pairs: list[int]) -> list[Array]:
+        def measure(index: int, k: int) -> tuple[float, Array]:
+            return self._measured(pairs[index], k)
+
+        def separate(index: int, direction: Array) -> Array:
+            pair = pairs[index]  # where there is one state, it is measured when its direction is known
+            return self.bounds[pair] if self.bounds.shape[1] == 1 else self.separate(pair, direction)
+
+        return list(sweep(self.bounds[pairs], measure, separate))
 
     def _measured(self, pair: int, k: int) -> tuple[float, Array]:
         """Measure, and remember the direction."""
@@ -75,7 +87,7 @@ class PairDistances:
                 for end in (k, k + 1):
                     if not hulls[pair, k] >= 0:
                         self._raise(hulls[pair], pair, self._measured(pair, end)[1], least[pair] + bows)
-        lowest: Array = np.nan_to_num(hulls, nan=-np.inf).min(axis=0, initial=np.inf)
+        lowest: Array = np.where(np.isnan(hulls), -np.inf, hulls).min(axis=0, initial=np.inf)
         return lowest
 
     def _raise(self, hull: Array, pair: int, direction: Array, wanted: Array) -> None:

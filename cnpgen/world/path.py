@@ -1,7 +1,7 @@
 """K robot states at once as Pinocchio and Coal see them: what the constraints' ``measured`` forms ask along a path."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,7 +45,6 @@ class PathWorld:
         ddq: Joint accelerations [rad/s^2], shape (n, K).
         jerk: Joint jerks [rad/s^3], shape (n, K); None where no constraint is about them.
         tip_position: Positions of the tip [m], shape (3, K).
-        tip_rotation: Rotation matrices of the tip frame, shape (3, 3, K).
     """
 
     def __init__(
@@ -62,14 +61,19 @@ class PathWorld:
         self._data, self._trace = self._model.createData(), Trace(self._model)
         self._pool = pin.ModelPool(self._model, 1)
         self._tip = robot.tip_frame
+        frame = self._model.frames[self._tip]
+        self._carrier, tip = frame.parentJoint, frame.placement.homogeneous
+        self._turn, self._offset = tip[:3, :3], tip[:3, 3].copy()
         self._skeleton = np.array(robot.skeleton, np.int64).reshape(-1, 2)
         self._object_size = None if object_size is None else np.array(object_size)
         self._scene = Scene(object_size, 1)
         self._bodies = None if robot.shape is None else Bodies(robot.shape, len(obstacles), robot.n)
         rest = np.zeros((robot.n, 1))
-        self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles))
+        self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
 
-    def set_path(self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None) -> None:
+    def set_path(
+        self, q: Array, dq: Array, ddq: Array, tops: Array, jerk: Array | None = None, *, exact: bool = True
+    ) -> None:
         """Move to K states.
 
         Args:
@@ -78,26 +82,36 @@ class PathWorld:
             ddq: Joint accelerations [rad/s^2], shape (n, K).
             tops: The numbers of the obstacles (``cnpgen.robots.solid``).
             jerk: Joint jerks [rad/s^3], shape (n, K), if they are wanted.
+            exact: Whether the smallest distance is to be exact even where bounds show that all of them are enough.
         """
-        self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
+        self.q, self.dq, self.ddq, self.jerk, self._exact = q, dq, ddq, jerk, exact
         self._placed = False
         self._torque: Array | None = None
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
-        self._pairs: dict[str | int, PairDistances] = {}
-        self._object_distances: list[Array] | None = None
+        self._pairs: dict[str, PairDistances] = {}
         self._solids = solids_of(self.obstacles, tops)
         self._scene.place(self._solids)
         self._move()
 
     def _move(self) -> None:
         """Run the forward kinematics of every state and keep where the joints and the tip are."""
-        frame = self._model.frames[self._tip]
         self._rotations, self._origins = self._trace.poses(self.q)
-        rotation, placement = self._rotations[frame.parentJoint], frame.placement
-        self.tip_rotation = np.tensordot(placement.rotation.T, rotation, axes=(1, 1)).transpose(1, 0, 2)
-        along = np.tensordot(placement.translation, rotation, axes=(0, 1))
-        self.tip_position = along + self._origins[frame.parentJoint]
+        self._tip_rotation: Array | None = None
+        along = self._offset @ self._axes_of_tip()
+        self.tip_position = along.reshape(3, -1) + self._origins[self._carrier]
+
+    def _axes_of_tip(self) -> Array:
+        """Return the axes of the joint that carries the tip, all their components and states in a row, (3, 3 K)."""
+        axes: Array = self._rotations[self._carrier].swapaxes(0, 1)
+        return axes.reshape(3, -1)
+
+    @property
+    def tip_rotation(self) -> Array:
+        """Rotation matrices of the tip frame, shape (3, 3, K)."""
+        if self._tip_rotation is None:
+            self._tip_rotation = (self._turn.T @ self._axes_of_tip()).reshape(3, 3, -1).swapaxes(0, 1)
+        return self._tip_rotation
 
     @property
     def torque(self) -> Array:
@@ -140,14 +154,16 @@ class PathWorld:
         velocity = np.array(pin.getFrameVelocity(model, data, tip, frame).linear)
         return velocity, np.array(pin.getFrameClassicalAcceleration(model, data, tip, frame).linear)
 
-    def segment_distances(self) -> list[Array]:
+    def segment_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of every segment of the robot's skeleton from every obstacle, one by one [m].
+
+        Args:
+            enough: If all are at least this, bounds of them that show it do where the path is not exact [m].
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
         """
-        pairs = self.segment_pairs()
-        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+        return self._smallest(self.segment_pairs(), enough)
 
     def segment_pairs(self) -> PairDistances:
         """Tell the signed distances of every segment of the robot's skeleton from every obstacle, one by one."""
@@ -156,8 +172,8 @@ class PathWorld:
     def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids
         ends = [(segment, solid) for segment in segments for solid in solids]
-        corners = [(segment.min(axis=0), segment.max(axis=0)) for segment in segments]
-        bounds = [gaps(low, high, solid) for low, high in corners for solid in solids]
+        low, high = (pick(segments[:, 0], segments[:, 1]) for pick in (np.minimum, np.maximum))
+        bounds = gaps(low, high, solids).reshape(-1, self.q.shape[1])
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             a, b = ends[pair][0][..., k].tolist()
@@ -166,10 +182,13 @@ class PathWorld:
         def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
             return separation(ends[pair][0][..., which], ends[pair][1], direction)
 
-        return PairDistances(np.array(bounds).reshape(len(bounds), self.q.shape[1]), measure, separate)
+        return PairDistances(bounds, measure, separate)
 
-    def shape_distances(self) -> list[Array]:
+    def shape_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
+
+        Args:
+            enough: As of ``segment_distances``.
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
@@ -177,25 +196,31 @@ class PathWorld:
         Raises:
             RecipeError: The robot has no shape.
         """
-        pairs = self.shape_pairs()
-        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+        return self._smallest(self.shape_pairs(), enough)
 
     def shape_pairs(self) -> PairDistances:
         """Tell the signed distances of every moving piece of the robot's shape from every obstacle, one by one."""
         bodies = self._placed_bodies()
         return self._once("shape", lambda: bodies.between(bodies.from_obstacles))
 
-    def self_distances(self) -> list[Array]:
+    def self_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
-        pairs = self.self_pairs()
-        return pairs.smallest() if self._is_somewhere() else self._unknown(len(pairs.bounds))
+        return self._smallest(self.self_pairs(), enough)
 
     def self_pairs(self) -> PairDistances:
         """Tell the signed distances of every two pieces of the robot's shape that must not touch."""
         bodies = self._placed_bodies()
         return self._once("self", lambda: bodies.between(bodies.among_links))
 
-    def _once(self, what: str | int, make: Callable[[], PairDistances]) -> PairDistances:
+    def _smallest(self, pairs: PairDistances, enough: float, *, of_each: bool = False) -> list[Array]:
+        """Measure distances of which the smallest, or that of each pair, is exact if it is to be, or not enough."""
+        if not self._is_somewhere():
+            return [np.full(self.q.shape[1], np.nan) for _ in pairs.bounds]
+        if not self._exact and (pairs.bounds >= enough).all():
+            return list(pairs.bounds)
+        return pairs.smallest_of_each() if of_each else pairs.smallest()
+
+    def _once(self, what: str, make: Callable[[], PairDistances]) -> PairDistances:
         """Return what was made since the robot moved, or make it."""
         if what not in self._pairs:
             self._pairs[what] = make()
@@ -218,12 +243,16 @@ class PathWorld:
         Returns:
             Shape (n,).
         """
-        frame, bodies = self._model.frames[self._tip], self._bodies
+        return self._trace.reach(self._spread, furthest)
+
+    @cached_property
+    def _spread(self) -> Array:
+        """How far from the origins of the base and of every joint what they move reaches [m], shape (n + 1,)."""
+        bodies = self._bodies
         spread = np.array([bodies.spread(joint) if bodies else 0.0 for joint in range(self.robot.n + 1)])
         held = 0.0 if self._object_size is None else np.linalg.norm(self._object_size) / 2
-        tip = np.linalg.norm(frame.placement.translation) + held
-        spread[frame.parentJoint] = max(spread[frame.parentJoint], tip)
-        return self._trace.reach(spread, furthest)
+        spread[self._carrier] = max(spread[self._carrier], np.linalg.norm(self._offset) + held)
+        return spread
 
     def _placed_bodies(self) -> Bodies:
         """Return the robot's shape where the robot is."""
@@ -234,8 +263,11 @@ class PathWorld:
             self._placed = True
         return self._bodies
 
-    def object_distances(self) -> list[Array]:
+    def object_distances(self, enough: float = np.inf) -> list[Array]:
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
+
+        Args:
+            enough: As of ``segment_distances``.
 
         Returns:
             Arrays of shape (K,), of each of which the smallest value is exact; see ``cnpgen.world.sweep.sweep``.
@@ -243,41 +275,23 @@ class PathWorld:
         Raises:
             RecipeError: The problem has no object.
         """
-        if self._object_distances is None:
-            self._require_object()
-            pairs = self._object_from_each()
-            found = [each.smallest()[0] for each in pairs] if self._is_somewhere() else self._unknown(len(pairs))
-            self._object_distances = found
-        return self._object_distances
+        return self._smallest(self.object_pairs(), enough, of_each=True)
 
     def object_pairs(self) -> PairDistances:
         """Tell the signed distances of the held object from every obstacle."""
-        pairs = self._object_from_each()
-        bounds = np.concatenate([np.empty((0, self.q.shape[1])), *(each.bounds for each in pairs)])
+        return self._once("object", self._from_object)
+
+    def _from_object(self) -> PairDistances:
+        position, rotation = self.tip_position, self.tip_rotation
+        size, solids = self._require_object(), self._solids
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
-            return pairs[pair].measure(0, k)
+            return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), pair)
 
         def separate(pair: int, direction: Array, which: Which = slice(None), /) -> Array:
-            return pairs[pair].separate(0, direction, which)
+            return cuboid_separation(position[:, which], rotation[..., which], size, solids[pair], direction)
 
-        return PairDistances(bounds, measure, separate, {i: each.known.get(0, []) for i, each in enumerate(pairs)})
-
-    def _object_from_each(self) -> list[PairDistances]:
-        return [self._once(index, partial(self._from_object, index)) for index in range(len(self._solids))]
-
-    def _from_object(self, index: int) -> PairDistances:
-        """Tell the signed distances of the held object from one obstacle."""
-        position, rotation = self.tip_position, self.tip_rotation
-        size, solid = self._require_object(), self._solids[index]
-
-        def measure(_: int, k: int) -> tuple[float, Array]:
-            return self._scene.object_apart(position[:, k].copy(), rotation[..., k].copy(), index)
-
-        def separate(_: int, direction: Array, which: Which = slice(None), /) -> Array:
-            return cuboid_separation(position[:, which], rotation[..., which], size, solid, direction)
-
-        return PairDistances(cuboid_gaps(position, rotation, size, solid)[None], measure, separate)
+        return PairDistances(cuboid_gaps(position, rotation, size, solids), measure, separate)
 
     def _require_object(self) -> Array:
         """Return the object's edge lengths [m], shape (3,)."""
@@ -307,6 +321,3 @@ class PathWorld:
 
     def _is_somewhere(self) -> bool:
         return bool(np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all())
-
-    def _unknown(self, count: int) -> list[Array]:
-        return [np.full(self.q.shape[1], np.nan) for _ in range(count)]

@@ -5,6 +5,8 @@ their separation ``min over a of u . a - max over b of u . b``: any u gives a lo
 faces are tried on all states at once; better vectors come from measurements (``cnpgen.world.sweep``).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,40 +46,47 @@ def cuboid_separation(position: Array, rotation: Array, size: Array, solid: Soli
     return np.asarray(direction @ position - reach - solid.furthest(direction))
 
 
-def gaps(low: Array, high: Array, solid: Solid) -> Array:
-    """Bound the distance of what lies between two corners from a solid.
+def gaps(low: Array, high: Array, solids: Sequence[Solid]) -> Array:
+    """Bound the distances of what lies between two corners from S solids.
 
     Where there are gaps along several axes, the distance is at least the length of the vector that they form.
 
     Args:
-        low: The body's lowest coordinates [m], shape (3, K).
-        high: Its highest ones.
-        solid: What stands still.
+        low: The lowest coordinates of bodies [m], shape (..., 3, K).
+        high: Their highest ones.
+        solids: What stands still.
 
     Returns:
-        Shape (K,).
+        Shape (..., S, K).
     """
-    gap = np.maximum(low - solid.high[:, None], solid.low[:, None] - high)
+    floor, top = _boxes(solids)
+    gap = np.maximum(low[..., None, :, :] - top[..., None], floor[..., None] - high[..., None, :, :])
     apart = np.maximum(gap, 0.0)
-    distance = np.sqrt(np.einsum("ik,ik->k", apart, apart))
-    return np.asarray(np.where(distance > 0, distance, gap.max(axis=0)))
+    distance = np.sqrt((apart * apart).sum(axis=-2))
+    return np.asarray(np.where(distance > 0, distance, gap.max(axis=-2)))
 
 
-def cuboid_gaps(position: Array, rotation: Array, size: Array, solid: Solid) -> Array:
-    """Bound the signed distance of a cuboid from what stands still, by the faces of it and of the box that holds that.
+def cuboid_gaps(position: Array, rotation: Array, size: Array, solids: Sequence[Solid]) -> Array:
+    """Bound the signed distances of a cuboid from S solids, by the faces of it and of the boxes that hold those.
 
     Args:
         position: The cuboid's centre [m], shape (3, K).
         rotation: Its rotation matrices, shape (3, 3, K).
         size: Its edge lengths [m], shape (3,).
-        solid: What stands still.
+        solids: What stands still.
 
     Returns:
-        Shape (K,).
+        Shape (S, K).
     """
-    turned = np.abs(rotation)
+    turned, (floor, top) = np.abs(rotation), _boxes(solids)
     reach = np.einsum("ijk,j->ik", turned, size / 2)  # of the cuboid along the world's axes
-    middle, half = (solid.low + solid.high) / 2, (solid.high - solid.low) / 2
-    centre = np.einsum("ijk,ik->jk", rotation, position - middle[:, None])  # in the cuboid's axes
-    own = np.abs(centre) - (size / 2)[:, None] - np.einsum("ijk,i->jk", turned, half)
-    return np.asarray(np.maximum(gaps(position - reach, position + reach, solid), own.max(axis=0)))
+    away = position - (floor + top)[..., None] / 2
+    centre = np.einsum("ijk,sik->sjk", rotation, away)  # in the cuboid's axes
+    own = np.abs(centre) - (size / 2)[:, None] - np.einsum("ijk,si->sjk", turned, (top - floor) / 2)
+    return np.asarray(np.maximum(gaps(position - reach, position + reach, solids), own.max(axis=1)))
+
+
+def _boxes(solids: Sequence[Solid]) -> tuple[Array, Array]:
+    """Return the lowest and the highest coordinates of S solids [m], shape (S, 3) each."""
+    low, high = ([getattr(each, end) for each in solids] for end in ("low", "high"))
+    return np.array(low).reshape(-1, 3), np.array(high).reshape(-1, 3)

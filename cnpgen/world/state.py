@@ -141,7 +141,7 @@ class World:
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         return np.array(pin.getFrameClassicalAcceleration(self._model, self._data, self._tip, frame).linear)
 
-    def segment_distances(self) -> list[float]:
+    def segment_distances(self, enough: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is exact
         """Measure how far every segment of the robot's skeleton is from every obstacle, segment by segment [m]."""
         if self._distances is None:
             poses = self._data.oMi  # of the universe and joints 1 to n
@@ -150,7 +150,7 @@ class World:
             self._distances = self._scene.segment_distances([(points[a], points[b]) for a, b in self._skeleton])
         return self._distances
 
-    def shape_distances(self) -> list[float]:
+    def shape_distances(self, enough: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is exact
         """Measure the signed distance of every moving piece of the robot's shape from every obstacle, one by one [m].
 
         The smallest is exact, the others are lower bounds above it (``cnpgen.world.sweep.sweep``).
@@ -161,7 +161,7 @@ class World:
         bodies = self._placed_bodies()
         return [float(each[0]) for each in bodies.between(bodies.from_obstacles).smallest()]
 
-    def self_distances(self) -> list[float]:
+    def self_distances(self, enough: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is exact
         """Measure the signed distance of every two pieces of the robot's shape that must not touch [m]; likewise."""
         bodies = self._placed_bodies()
         return [float(each[0]) for each in bodies.between(bodies.among_links).smallest()]
@@ -177,7 +177,7 @@ class World:
             self._placed = True
         return self._bodies
 
-    def object_distances(self) -> list[float]:
+    def object_distances(self, enough: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is exact
         """Measure the signed distance of the held object from every obstacle [m]; negative is the depth of penetration.
 
         Raises:

@@ -1,5 +1,6 @@
 """Distances along a path, measured only where they can matter: by the smallest lower bound first."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -33,17 +34,17 @@ def sweep(bounds: Array, measure: Measure, separate: Separate) -> Array:
     found, best = bounds.copy(), np.inf
     measured: dict[tuple[int, int], float] = {}
     while found.size:
-        pair, k = divmod(int(np.argmin(found)), found.shape[1])
+        pair, k = divmod(int(found.argmin()), found.shape[1])
         if found[pair, k] >= best - RESOLUTION:
             break
         distance, direction = measure(pair, k)
         measured[pair, k] = distance
-        if np.isnan(distance):
+        if math.isnan(distance):
             break
         if np.isfinite(direction).all():
             np.maximum(found[pair], separate(pair, direction), out=found[pair])
         found[pair, k], best = distance, min(best, distance)
-    found = np.maximum(found, np.nextafter(best, np.inf))
+    np.maximum(found, math.nextafter(best, math.inf), out=found)
     for where, distance in measured.items():
         found[where] = distance
     return found

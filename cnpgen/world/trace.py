@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_ORIGIN, _SLIDE = 3, 7  # rows of what a joint's pose is made of: its origin, and how it slides
 VOUCHED = 1e-9  # how far poses may be from Pinocchio's, beside 1 + the largest joint position
 
 
@@ -30,6 +31,8 @@ class Trace:
         self._model, self._data = model, model.createData()
         self._parents = list(model.parents)[1:]
         self._parts = [_parts(model, joint) for joint in range(1, model.njoints)]
+        self._lengths = np.array([np.linalg.norm(parts[[_ORIGIN, _SLIDE], :3], axis=1) for parts in self._parts])
+        self._slides = self._lengths[:, 1] > 0
 
     def poses(self, q: Array) -> tuple[Array, Array]:
         """Compute the poses of all joints at K states.
@@ -45,23 +48,21 @@ class Trace:
             MachineError: They are not what Pinocchio says.
         """
         count = q.shape[1]
-        sin, cos = np.sin(q), np.cos(q)
-        axes = np.empty((len(q) + 1, 3, 3, count))  # of every joint its x, y and z axis in the world
-        origins = np.zeros((len(q) + 1, 3, count))
-        axes[0] = np.eye(3)[..., None]
-        found = np.empty((11, 3 * count))  # the same memory for all joints: new pages take longer than all else
-        still, turned, back, (offset, slide) = np.split(found.reshape(-1, 3, count), (3, 6, 9))
+        turns = np.empty((len(q), 2, count))
+        np.sin(q, out=turns[:, 0])
+        np.cos(q, out=turns[:, 1])
+        turns[self._slides, 0] = q[self._slides]
+        frames = np.empty((len(q) + 1, 4, 3, count))  # of every joint its x, y and z axis and its origin in the world
+        frames[0] = np.eye(4, 3)[..., None]
+        found = np.empty((12, 3 * count))  # the same memory for all joints: new pages take longer than all else
+        still, moved = found[:4].reshape(4, 3, count), found[4:].reshape(2, 4, 3, count)
         for joint, (parent, parts) in enumerate(zip(self._parents, self._parts, strict=True), 1):
-            np.matmul(parts, axes[parent].reshape(3, -1), out=found)
-            turned *= sin[joint - 1]
-            back *= cos[joint - 1]
-            slide *= q[joint - 1]
-            np.add(still, turned, out=axes[joint])
-            axes[joint] += back
-            origins[joint] = origins[parent] + offset + slide
-        rotations = axes.transpose(0, 2, 1, 3)
-        self._check(q, rotations, origins)
-        return rotations, origins
+            np.matmul(parts, frames[parent].reshape(4, -1), out=found)
+            moved *= turns[joint - 1, :, None, None]
+            np.add(still, moved[0], out=frames[joint])
+            frames[joint] += moved[1]
+        self._check(q, frames)
+        return frames[:, :3].swapaxes(1, 2), frames[:, 3]
 
     def reach(self, spread: Array, furthest: Array) -> Array:
         """Bound how far a unit of each joint's speed moves any point of what it carries, seen from before it [m].
@@ -73,41 +74,45 @@ class Trace:
         Returns:
             Shape (n,): the length of the way to the furthest point; 1 for joints that slide.
         """
-        sizes = [np.linalg.norm(parts[9:], axis=1) for parts in self._parts]
-        lengths = np.array([offset + slide * q for (offset, slide), q in zip(sizes, furthest, strict=True)])
+        lengths = self._lengths[:, 0] + self._lengths[:, 1] * furthest
         found = spread[1:].copy()
         for joint in range(len(found), 1, -1):
             found[joint - 2] = max(found[joint - 2], lengths[joint - 1] + found[joint - 1])
         if self._parents != list(range(len(found))):  # it branches: links see each other across the whole of it
             found[:] = lengths.sum() + 2 * spread.max()
-        return np.where([slide > 0 for _, slide in sizes], 1.0, found)
+        return np.where(self._slides, 1.0, found)
 
-    def _check(self, q: Array, rotations: Array, positions: Array) -> None:
+    def _check(self, q: Array, frames: Array) -> None:
         """Compare the first, the middle and the last state with Pinocchio's."""
+        looked = [0, q.shape[1] // 2, -1]
+        states, poses = q[:, looked].T.copy(), frames[-1][..., looked]
+        off = float(np.abs(poses - np.array([self._tell(state) for state in states]).T).max())
+        if off > VOUCHED * (1 + np.abs(states).max()):
+            raise MachineError(f"forward kinematics differ from Pinocchio's by {off:.2g} at one of {states.tolist()}")
+
+    def _tell(self, state: Array) -> Array:
+        """Return the last joint's pose as Pinocchio says it, shape (3, 4)."""
         import pinocchio as pin
 
-        for k in (0, q.shape[1] // 2, -1):
-            state = q[:, k].copy()
-            pin.forwardKinematics(self._model, self._data, state)
-            pose, near = self._data.oMi[len(q)], VOUCHED * (1 + float(np.abs(state).max()))
-            turned, moved = pose.rotation - rotations[-1, ..., k], pose.translation - positions[-1, :, k]
-            off = max(float(np.abs(turned).max()), float(np.abs(moved).max()))
-            if off > near:
-                raise MachineError(f"forward kinematics differ from Pinocchio's by {off:.2g} at {state.tolist()}")
+        pin.forwardKinematics(self._model, self._data, state)
+        return np.asarray(self._data.oMi[len(self._parts)].homogeneous[:3])
 
 
 def _parts(model: "pin.Model", joint: int) -> Array:
-    """Return a joint's pose in its parent's frame as rows of numbers, shape (11, 3).
+    """Return what a joint's pose is made of, in its parent's frame, shape (12, 4).
 
-    Its axes are those of the first three rows, the next three times sin q, and the next three times cos q, added; its
-    origin is the last but one and the last times q.
+    Its x, y and z axis and its origin are the first four rows, the next four times sin q, and the last four times cos
+    q, added; of a joint that slides they are the first four, and the next four times q. A point (x, y, z) is (x, y, z,
+    1), a vector (x, y, z, 0).
     """
     data = model.joints[joint].createData()
     model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
     motion = np.array(data.S).reshape(6)
     x, y, z = motion[3:]
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    place = model.jointPlacements[joint]
+    place, parts = model.jointPlacements[joint], np.zeros((12, 4))
     turn = [np.eye(3) + across @ across, across, -across @ across]  # Rodrigues' formula
-    axes = [(place.rotation @ each).T for each in turn]
-    return np.concatenate([*axes, [place.translation], [place.rotation @ motion[:3]]])
+    parts.reshape(3, 4, 4)[:, :3, :3] = [(place.rotation @ each).T for each in turn]
+    parts[_ORIGIN] = [*place.translation, 1.0]
+    parts[_SLIDE, :3] = place.rotation @ motion[:3]
+    return parts

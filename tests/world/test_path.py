@@ -140,6 +140,25 @@ def test_skipping_agrees_with_brute_force_on_random_motions(seed):
     assert_nothing_is_hidden(world.object_distances(), objects)
 
 
+def test_a_path_that_is_not_exact_measures_only_where_bounds_do_not_show_enough():
+    """Its distances are bounds that are enough, where there are such, and those of an exact path elsewhere."""
+    problem = PROBLEMS["heavy-object"]
+    world, tops = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size), np.full(2, -0.3)
+    states = wandering(world.robot, seed=12, count=400)
+    told = {}
+    for exact in (True, False):
+        world.set_path(*states, tops, exact=exact)
+        for what in ("segment", "object"):
+            distances = getattr(world, f"{what}_distances")
+            least = np.min(getattr(world, f"{what}_pairs")().bounds)
+            told[what, exact] = [np.array(distances(enough)) for enough in (least - 1e-3, least + 1e-3)]
+    for what in ("segment", "object"):
+        (known, _), (rough, measured) = told[what, True], told[what, False]
+        assert (rough <= known + 1e-9).all()
+        assert rough.min() < known.min() - 1e-3
+        np.testing.assert_array_equal(measured, known)
+
+
 def test_skipping_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal():
     problem, plan = PROBLEMS["heavy-object"], PLANS["dragging"]
     motion = Motion(np.array([plan["path"]]), np.array([plan["rate"]]))

@@ -40,7 +40,7 @@ def coal_distance(shape: object, position: np.ndarray, rotation: np.ndarray, box
 def test_bounds_of_a_cuboid_are_never_above_its_distance(seed: int) -> None:
     position, rotation, box = draw(seed)
     vertices = np.einsum("vj,ijk->vik", CORNERS * SIZE, rotation) + position
-    bounds = cuboid_gaps(position, rotation, SIZE, box)
+    bounds = cuboid_gaps(position, rotation, SIZE, [box])[0]
     random, tight, overlapping = np.random.default_rng(seed), 0, 0
     for k in range(position.shape[1]):
         distance, direction = coal_distance(coal.Box(*SIZE), position[:, k], rotation[..., k].copy(), box)
@@ -62,7 +62,7 @@ def test_bounds_of_a_segment_are_never_above_its_distance(seed: int) -> None:
     middle, rotation, box = draw(seed)
     half = 0.2 * rotation[:, 2]
     ends = np.array([middle - half, middle + half])
-    bounds = np.maximum(gaps(ends.min(axis=0), ends.max(axis=0), box), 0.0)
+    bounds = np.maximum(gaps(ends.min(axis=0), ends.max(axis=0), [box])[0], 0.0)
     for k in range(middle.shape[1]):
         distance, direction = coal_distance(coal.Capsule(0.0, 0.4), middle[:, k], rotation[..., k].copy(), box)
         assert bounds[k] <= max(distance, 0.0) + 1e-9
@@ -75,9 +75,9 @@ def test_gaps_along_several_axes_form_a_distance() -> None:
         np.array([[1.0] * 3, [1.0] * 3, [1.0] * 3]),
     )
     box = box_between(np.array([-1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
-    np.testing.assert_allclose(gaps(low, high, box), [0.5, 0.5, np.sqrt(0.08)], atol=1e-15)
+    np.testing.assert_allclose(gaps(low, high, [box])[0], [0.5, 0.5, np.sqrt(0.08)], atol=1e-15)
 
 
 def test_of_what_overlaps_the_shallowest_depth_is_the_bound() -> None:
     low, high = np.array([[0.0], [0.0], [0.9]]), np.array([[1.0], [1.0], [1.5]])
-    assert gaps(low, high, box_between(np.zeros(3), np.ones(3)))[0] == pytest.approx(-0.1)
+    assert gaps(low, high, [box_between(np.zeros(3), np.ones(3))])[0, 0] == pytest.approx(-0.1)

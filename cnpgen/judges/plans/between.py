@@ -6,9 +6,10 @@ between its least and its largest coefficient, and halving its interval brings t
 wherever the largest value could still be proves where it is.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import accumulate, pairwise, product
 from math import comb
 
 import numpy as np
@@ -22,7 +23,7 @@ Peak = tuple[float, int, float]  # value, of which function, at which phase
 
 CLOSE = 1e-6  # how far below the largest value the one that is found may be, where that decides whether it is above 1
 ROUGH = 1e-2  # the same elsewhere
-HALVINGS = 40  # at most: pieces are then shorter than a picosecond
+DIVISIONS = 40  # at most: pieces are then shorter than a picosecond
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,10 @@ class Pieces:
 
     Attributes:
         edges: Phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,).
-        q: Coefficients [rad], shape (n, S, D + 1).
-        dq: Coefficients [rad/s], shape (n, S, 2 D).
-        ddq: Coefficients [rad/s^2], shape (n, S, 3 D - 1).
-        jerk: Coefficients [rad/s^3], shape (n, S, 4 D - 2); None where they are not wanted.
+        q: Coefficients [rad], shape (D + 1, S, n).
+        dq: Coefficients [rad/s], shape (2 D, S, n).
+        ddq: Coefficients [rad/s^2], shape (3 D - 1, S, n).
+        jerk: Coefficients [rad/s^3], shape (4 D - 2, S, n); None where they are not wanted.
     """
 
     edges: Array
@@ -48,51 +49,55 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> Pieces:
     """Return the polynomials of one motion, those of its jerks if they are wanted."""
     degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
     edges = _edges(len(path), len(rate), degree)
-    p, p1, p2 = (in_bernstein_form(path, degree, order, edges) for order in range(3))
-    r, r1 = (in_bernstein_form(rate, degree, order, edges) for order in range(2))
-    ddq = _product(_product(p2, r) + _product(p1, r1), r)
+    p, p1, p2, *p3 = in_bernstein_form(path, degree, range(3 + jerk), edges)
+    r, r1, *r2 = in_bernstein_form(rate, degree, range(2 + jerk), edges)
+    first, r_r = _product(np.concatenate([p1, r1], axis=2), r), _product(r, r)
+    dq, r1_r = first[..., :-1], first[..., -1:]
+    ddq = _product(p2, r_r) + _product(p1, r1_r)
     if not jerk:
-        return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq)
-    p3, r2 = in_bernstein_form(path, degree, 3, edges), in_bernstein_form(rate, degree, 2, edges)
-    bends = _product(_product(p3, r) + 3 * _product(p2, r1), r)
-    third = _product(bends + _product(p1, _product(r2, r) + _product(r1, r1)), r)
-    return Pieces(edges, q=p, dq=_product(p1, r), ddq=ddq, jerk=third)
+        return Pieces(edges, q=p, dq=dq, ddq=ddq)
+    bends = _product(p3[0], _product(r_r, r)) + _product(p2, 3 * _product(r1_r, r))
+    third = bends + _product(p1, _product(_product(r2[0], r) + _product(r1, r1), r))
+    return Pieces(edges, q=p, dq=dq, ddq=ddq, jerk=third)
 
 
-def largest(rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least: float = -np.inf) -> Peak:
+def largest(
+    rows: Array, edges: Array, known: Peak = (-np.inf, 0, 0.0), *, least: float = -np.inf, parts: int = 2
+) -> Peak:
     """Find the largest value of piecewise polynomials to within ``ROUGH``, and whether it is above 1 to ``CLOSE``.
 
     Args:
-        rows: Bernstein coefficients of M functions, finite, shape (M, S, d + 1).
+        rows: Bernstein coefficients of M functions, finite, shape (d + 1, S, M).
         edges: Phases between which they are polynomials, shape (S + 1,).
         known: A value that is attained, as returned.
         least: What is proven to be no larger than this, at most 1, is not looked into.
+        parts: How many parts a piece is divided into at a time, a power of 2.
 
     Returns:
         ``(value, row, s)``: the largest value that is attained, of which function, at which phase.
     """
     best, *at = known
-    of_row, span = np.nonzero(_worth_halving(rows.max(axis=2), best, least))
-    pieces, left, width = rows[of_row, span], edges[span], np.diff(edges)[span]
-    for _ in range(HALVINGS):
-        if not len(pieces):
+    starts = np.arange(parts)[:, None] / parts
+    span, of_row = (rows.max(axis=0) > _worth_dividing(best, least)).nonzero()
+    pieces, left, width = rows[:, span, of_row], edges[span], (edges[1:] - edges[:-1])[span]
+    for _ in range(DIVISIONS):
+        if not len(span):
             break
-        width = width / 2
-        left = np.concatenate([left, left + width])
-        width, of_row = np.concatenate([width, width]), np.concatenate([of_row, of_row])
-        pieces = np.concatenate([pieces @ half for half in _halving(rows.shape[2])])
-        for k, s in ((0, left), (-1, left + width)):
-            top = int(np.argmax(pieces[:, k]))
-            if pieces[top, k] > best:
-                best, *at = float(pieces[top, k]), int(of_row[top]), float(s[top])
-        kept = _worth_halving(pieces.max(axis=1), best, least)
-        pieces, of_row, left, width = pieces[kept], of_row[kept], left[kept], width[kept]
+        pieces = (_dividing(len(rows), parts) @ pieces).reshape(len(rows), -1)
+        left = (left + starts * width).ravel()
+        width, of_row = np.concatenate([width / parts] * parts), np.concatenate([of_row] * parts)
+        for values, s in ((pieces[0], left), (pieces[-1], left + width)):
+            top = int(values.argmax())
+            if values[top] > best:
+                best, *at = float(values[top]), int(of_row[top]), float(s[top])
+        (span,) = (pieces.max(axis=0) > _worth_dividing(best, least)).nonzero()
+        pieces, of_row, left, width = pieces[:, span], of_row[span], left[span], width[span]
     return best, int(at[0]), at[1]
 
 
-def _worth_halving(hull: Array, best: float, least: float) -> NDArray[np.bool_]:
-    """Find pieces whose largest coefficients could hide more than is known."""
-    return np.asarray((hull > least) & (hull > best + np.where((hull > 1) & (best <= 1), CLOSE, ROUGH)))
+def _worth_dividing(best: float, least: float) -> float:
+    """Return what the largest coefficient of a piece is above if it could hide more than is known."""
+    return max(least, best + ROUGH if best > 1 else min(best + ROUGH, max(1.0, best + CLOSE)))
 
 
 @cache
@@ -108,27 +113,29 @@ def _edges(path_points: int, rate_points: int, degree: int) -> Array:
     return np.array(sorted(knots(path_points, rate_points, degree)))
 
 
-def in_bernstein_form(control: Array, degree: int, order: int, edges: Array) -> Array:
-    """Return a derivative of splines between edges, shape (n, S, D - order + 1); ``control`` has shape (C, n)."""
-    matrix = _to_bernstein_form(len(control), degree, order, tuple(edges.tolist()))
-    pieces = (matrix @ control).reshape(len(edges) - 1, degree - order + 1, -1)
-    return np.ascontiguousarray(pieces.transpose(2, 0, 1))
+def in_bernstein_form(control: Array, degree: int, orders: Sequence[int], edges: Array) -> list[Array]:
+    """Return derivatives of splines between edges, shape (D - order + 1, S, n) each; ``control`` has shape (C, n)."""
+    matrix = _to_bernstein_form(len(control), degree, tuple(orders), tuple(edges.tolist()))
+    pieces = (matrix @ control).reshape(-1, len(edges) - 1, control.shape[1])
+    ends = accumulate((degree - order + 1 for order in orders), initial=0)
+    return [pieces[first:last] for first, last in pairwise(ends)]
 
 
 @cache
-def _to_bernstein_form(points: int, degree: int, order: int, edges: tuple[float, ...]) -> Array:
-    """Return the matrix from control points to a derivative's Bernstein coefficients, shape (S (D - order + 1), C).
+def _to_bernstein_form(points: int, degree: int, orders: tuple[int, ...], edges: tuple[float, ...]) -> Array:
+    """Return the matrix from control points to a derivative's Bernstein coefficients, and then to the next one's.
 
     The coefficients between a and b are the values of the derivative's polar form, at arguments of which ever more are
-    b instead of a (Ramshaw, "Blossoms are polar forms", 1989).
+    b instead of a (Ramshaw, "Blossoms are polar forms", 1989). Its shape is (all of them, C), piece after piece of the
+    first coefficient, then of the second.
     """
-    knots, matrix = derivative(points, degree, order)
-    degree -= order
     rows = []
-    for low, high in pairwise(edges):
-        last = int(np.searchsorted(knots, (low + high) / 2)) - 1
-        rows += [_polar(knots, last, [low] * (degree - k) + [high] * k) for k in range(degree + 1)]
-    return np.asarray(np.array(rows) @ matrix)
+    for order in orders:
+        (knots, matrix), size = derivative(points, degree, order), degree - order
+        for k, (low, high) in product(range(size + 1), pairwise(edges)):
+            last = int(np.searchsorted(knots, (low + high) / 2)) - 1
+            rows.append(_polar(knots, last, [low] * (size - k) + [high] * k) @ matrix)
+    return np.array(rows)
 
 
 def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
@@ -149,23 +156,35 @@ def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Multiply functions (n, S, i + 1) by one function (1, S, j + 1), piece by piece."""
-    outer = (a[..., :, None] * b[..., None, :]).reshape(-1, a.shape[-1] * b.shape[-1])
-    return np.asarray((outer @ _products(a.shape[-1] - 1, b.shape[-1] - 1)).reshape(*a.shape[:-1], -1))
+    """Multiply functions (i + 1, S, n) by one function (j + 1, S, 1), piece by piece."""
+    i, j = len(a) - 1, len(b) - 1
+    times_b = (b[..., 0].T @ _products(i, j)).reshape(-1, i + j + 1, i + 1)
+    found = np.empty((i + j + 1, *a.shape[1:]))
+    np.matmul(times_b, a.swapaxes(0, 1), out=found.swapaxes(0, 1))
+    return found
 
 
 @cache
 def _products(i: int, j: int) -> Array:
-    """Return the matrix from products of coefficients to coefficients of the product, shape ((i+1) (j+1), i+j+1)."""
-    matrix = np.zeros((i + 1, j + 1, i + j + 1))
+    """Return what makes, of one function's coefficients, the matrix that multiplies by it, shape (j+1, (i+j+1) (i+1)).
+
+    That matrix turns coefficients of a function of degree i into those of the product.
+    """
+    matrix = np.zeros((j + 1, i + j + 1, i + 1))
     for k in range(i + 1):
         for m in range(j + 1):
-            matrix[k, m, k + m] = comb(i, k) * comb(j, m) / comb(i + j, k + m)
-    return matrix.reshape(-1, i + j + 1)
+            matrix[m, k + m, k] = comb(i, k) * comb(j, m) / comb(i + j, k + m)
+    return matrix.reshape(j + 1, -1)
 
 
 @cache
-def _halving(size: int) -> tuple[Array, Array]:
-    """Return de Casteljau's matrices at the middle: ``coefficients @ first`` are those of the first half."""
-    first = np.array([[comb(k, m) / 2**k for k in range(size)] for m in range(size)])
-    return first, np.ascontiguousarray(first[::-1, ::-1])
+def _dividing(size: int, parts: int) -> Array:
+    """Return de Casteljau's matrix for parts of equal length, a power of 2, shape (parts (d + 1), d + 1).
+
+    It turns coefficients into the first ones of all parts, then the second ones of all, and so on.
+    """
+    first = np.array([[comb(k, m) / 2**k for m in range(size)] for k in range(size)])
+    found = [np.eye(size)]
+    while len(found) < parts:
+        found = [half @ each for each in found for half in (first, first[::-1, ::-1])]
+    return np.stack(found, axis=1).reshape(-1, size)

@@ -31,9 +31,9 @@ def bows(motion: Motion, s: Array, reach: Array) -> Array:
     """
     path, degree = motion.path[0], motion.degree
     edges = np.linspace(0, 1, PARTS * (len(path) - degree) + 1)
-    first, second = (np.abs(in_bernstein_form(path, degree, order, edges)).max(axis=2) for order in (1, 2))
-    before = np.cumsum(first, axis=0) - first
-    bent = reach @ (second + first * (first + 2 * before))
+    first, second = (np.abs(each).max(axis=0) for each in in_bernstein_form(path, degree, (1, 2), edges))
+    before = np.cumsum(first, axis=1) - first
+    bent = (second + first * (first + 2 * before)) @ reach
     low, high = np.searchsorted(edges[1:-1], s[:-1], "right"), np.searchsorted(edges[1:-1], s[1:], "left")
-    step = np.maximum(np.diff(s), 0.0)
+    step = np.maximum(s[1:] - s[:-1], 0.0)
     return np.asarray(step**2 / 8 * np.maximum(bent[low], bent[high]))

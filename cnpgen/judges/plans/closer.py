@@ -101,7 +101,7 @@ def _intervals(survey: Survey, s: Array, contacts: Sequence[Measured], reach: Ar
     ``s`` has shape (rows, K), ``reach`` is what ``PathWorld.reach`` says.
     """
     world, last = survey.world, s.shape[1] - 1
-    ways, leave = reach @ np.abs(np.diff(world.q, axis=1)), bows(survey.motion, s.ravel(), reach)
+    ways, leave = reach @ np.abs(world.q[:, 1:] - world.q[:, :-1]), bows(survey.motion, s.ravel(), reach)
     ways[last :: last + 1] = -np.inf  # from row to row nobody asks
     found = []
     for contact in contacts:

@@ -5,6 +5,7 @@ control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or dist
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import chain
 
 import numpy as np
@@ -14,7 +15,7 @@ from cnpgen.errors import UsageError
 from cnpgen.judges.plans.between import knots, polynomials
 from cnpgen.judges.plans.closer import look_closer
 from cnpgen.judges.plans.course import Course, Phases, course, course_at, jerks
-from cnpgen.judges.plans.limits import is_proven, limit_margin
+from cnpgen.judges.plans.limits import Limits, limits_of
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
 from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.paper import paper_rule
@@ -86,6 +87,7 @@ class Judge:
         check_step(step)
         self._problem, self._robot, self._step = problem, robot, step
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
+        self._limits = limits_of(problem, self._world)
 
     def __call__(
         self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, brief: bool = False
@@ -97,7 +99,7 @@ class Judge:
         """
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
         with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
-            return [_judge_plan(plan, self._world, self._step, brief=brief) for plan in plans]
+            return [_judge_plan(plan, self._world, self._limits, self._step, brief=brief) for plan in plans]
 
     def refutes(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[bool]:
         """Say of N plans whether a few samples show that they are not valid; of those that pass nothing is known."""
@@ -155,16 +157,22 @@ class _Plan:
 
     @property
     def corners(self) -> frozenset[float]:
-        """Phases at which constraints change abruptly, two on either side of each, and the knots of both splines.
-
-        Second differences across a kink say nothing of what lies beside it.
-        """
-        kinks = (s + k * BESIDE for each in self.problem.constraint for s in each.kinks for k in range(-2, 3))
-        return knots(self.motion.path.shape[1], self.motion.rate.shape[1], self.motion.degree).union(kinks)
+        """Phases at which constraints change abruptly, two on either side of each, and the knots of both splines."""
+        kinks = tuple(s for each in self.problem.constraint for s in each.kinks)
+        return _corners(self.motion.path.shape[1], self.motion.rate.shape[1], self.motion.degree, kinks)
 
     def is_finite(self) -> bool:
         numbers = (self.motion.path, self.motion.rate, self.tops, self.goal_xyz, *vars(self.boundary).values())
-        return all(values is None or bool(np.isfinite(values).all()) for values in numbers)
+        return bool(np.isfinite(np.concatenate([each.ravel() for each in numbers if each is not None])).all())
+
+
+@lru_cache(maxsize=8)
+def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float, ...]) -> frozenset[float]:
+    """Return the knots of both splines, and two phases on either side of each kink.
+
+    Second differences across a kink say nothing of what lies beside it.
+    """
+    return knots(path_points, rate_points, degree).union(s + k * BESIDE for s in kinks for k in range(-2, 3))
 
 
 def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> None:
@@ -182,7 +190,7 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: A
             raise UsageError(f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {found}")
 
 
-def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> Verdict:
+def _judge_plan(plan: _Plan, world: PathWorld, limits: Limits, step: float, *, brief: bool) -> Verdict:
     """Judge one plan."""
     if fault := _fault(plan):
         return Verdict(fault)
@@ -193,31 +201,30 @@ def _judge_plan(plan: _Plan, world: PathWorld, step: float, *, brief: bool) -> V
     states, samples = found
     if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk, exact=not brief)
     ends = boundary_margins(states, plan.boundary, samples, world.robot)
     metrics, paper = Metrics(), PaperRule()
     if not brief:
         metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
         paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
-    margins = [*ends, *_margins(survey(plan.problem, plan.motion, plan.tops, world, samples, table), brief=brief)]
+    seen = survey(plan.problem, plan.motion, plan.tops, world, samples, table)
+    margins = [*ends, *_margins(seen, limits, brief=brief)]
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
-def _margins(survey: Survey, *, brief: bool) -> list[Margin]:
+def _margins(survey: Survey, limits: Limits, *, brief: bool) -> list[Margin]:
     """Measure every constraint, at the samples and between them; the survey's world is moved."""
-    pieces, margins = polynomials(survey.motion, jerk=survey.problem.uses_jerk), []
-    proven = {
-        id(each): limit_margin(each, survey.world, pieces, survey.samples.s, survey.table, brief=brief)
-        for each in survey.problem.constraint
-        if is_proven(each)
-    }
+    pieces, s, table = polynomials(survey.motion, jerk=survey.problem.uses_jerk), survey.samples.s, survey.table
+    proven = limits.margins(survey.world, pieces, s, table, brief=brief)
     worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
     for each, margin in chain(look_closer(survey, brief=brief), look_at_peaks(survey)):
         worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
-    for constraint in survey.problem.constraint:
-        margins += [proven[id(constraint)]] if id(constraint) in proven else []
-        margins += [worst[id(each)] for each in survey.measured if each.constraint is constraint]
-    return margins
+    found: dict[int, list[Margin]] = {id(constraint): [] for constraint in survey.problem.constraint}
+    for constraint, margin in zip(limits.constraints, proven, strict=True):
+        found[id(constraint)].append(margin)
+    for each in survey.measured:
+        found[id(each.constraint)].append(worst[id(each)])
+    return [*chain.from_iterable(found.values())]
 
 
 def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
@@ -228,7 +235,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     states = course_at(plan.motion, _GLANCE, jerk=plan.problem.uses_jerk)
     if not states.is_finite():
         return True
-    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk)
+    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk, exact=False)
     start_tip = world.tip_position[:, 0]
     found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
     if not all((each.share <= 1).all() for each in found):
@@ -256,7 +263,8 @@ def _fault(plan: _Plan) -> Reason | None:
     """Say why a plan cannot be evaluated, if it cannot."""
     if not plan.is_finite():
         return Reason.NOT_FINITE
-    return None if plan.motion.runs_forward()[0] else Reason.RATE
+    forward = plan.motion.rate.min() > 0 or plan.motion.runs_forward()[0]  # r is between its control points
+    return None if forward else Reason.RATE
 
 
 def reason_of(margins: list[Margin]) -> str:

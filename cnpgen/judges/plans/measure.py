@@ -49,24 +49,23 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot
     """
     margins = []
     for what, (name, unit, allowed) in BOUNDARY.items():
-        wanted = [getattr(boundary, f"{end}_{what}") for end in ("start", "goal")]
-        pairs = [(k, want[0]) for k, want in zip((0, -1), wanted, strict=True) if want is not None]
-        found = np.array([getattr(states, what)[:, k] for k, _ in pairs])
-        error = np.abs(found - np.array([want for _, want in pairs]))
-        end, joint = np.unravel_index(np.argmax(error), error.shape)
-        k, want = pairs[int(end)]
+        start, goal = getattr(boundary, f"start_{what}"), getattr(boundary, f"goal_{what}")
+        wanted = start if goal is None else np.concatenate([start, goal])
+        found = getattr(states, what).T[:: len(samples.s) - 1][: len(wanted)]  # at the start, and at the goal
+        error = np.abs(found - wanted)
+        end, joint = divmod(int(error.argmax()), error.shape[1])
         margins.append(
             Margin(
                 name,
                 Reason.BOUNDARY,
-                unit_of(robot.units(unit), int(joint)),
-                robot.joint_names[int(joint)],
+                unit_of(robot.units(unit), joint),
+                robot.joint_names[joint],
                 value=float(found[end, joint]),
-                bound=float(want[joint]),
+                bound=float(wanted[end, joint]),
                 excess=float(error[end, joint]),
                 allowed=allowed,
-                time=float(samples.t[k]),
-                phase=float(samples.s[k]),
+                time=float(samples.t[-end]),
+                phase=float(samples.s[-end]),
             )
         )
     return margins
@@ -103,7 +102,7 @@ class Measured:
 
     def margin(self, problem: Problem, samples: Samples) -> Margin:
         """Say where the motion comes closest to breaking the condition, or breaks it most."""
-        part, k = divmod(int(np.argmax(self.share)), len(samples.s))  # argmax finds the first that is nan, if any is
+        part, k = divmod(int(self.share.argmax()), len(samples.s))  # argmax finds the first that is nan, if any is
         low, high, g = self.condition.lower[part], self.condition.upper[part], self.g[part, k]
         worst = float(self.excess[part, k])
         return Margin(

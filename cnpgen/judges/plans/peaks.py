@@ -9,13 +9,13 @@ is divided, and its parts again, whose differences tell more.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.closer import is_contact
 from cnpgen.judges.plans.measure import Measured
+from cnpgen.judges.plans.sampling import APART
 from cnpgen.judges.plans.survey import Survey
 from cnpgen.judges.plans.verdict import Margin
 
@@ -28,7 +28,6 @@ FINER = 6  # parts of an interval
 ROUNDS = 10  # of divisions, at most; a smooth maximum takes two or three, a kink one per factor of FINER
 MOST = 256  # intervals of all conditions that are divided at a time
 TINY = 1e-30  # of what is allowed
-APART = 1e-7  # in phase: cells of which one sample counts; differences of nearer ones would be rounding
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,9 @@ class _Rows:
         least = np.maximum(largest + ROUGH, 0.0)
         least = np.where(largest <= 1, np.minimum(least, 1 + CLOSE), least)
         tops = _tops(self.s, self.share)
-        row, k = np.nonzero(tops > least[self.of, None])
+        row, k = (tops > least[self.of, None]).nonzero()
+        if not len(row):
+            return row, row, np.empty((0, 2))
         chosen = np.argsort(-tops[row, k], kind="stable")[:MOST]
         row, k = row[chosen], k[chosen]
         phases = np.broadcast_to(self.s, self.share.shape)
@@ -73,7 +74,7 @@ def look_at_peaks(survey: Survey) -> Iterator[tuple[Measured, Margin]]:
         survey: A motion; its world is moved.
     """
     smooth = [each for each in survey.measured if not is_contact(each.constraint)]
-    largest = np.array([np.max(each.share, initial=-np.inf) for each in smooth])
+    largest = np.array([each.share.max() for each in smooth])
     rows = _first(survey.samples.s, smooth)
     for _ in range(ROUNDS):
         of, part, ends = rows.promising(largest)
@@ -97,28 +98,29 @@ def _again(survey: Survey, each: Measured, s: Array) -> Measured:
 
 def _first(s: Array, measured: Sequence[Measured]) -> _Rows:
     """Return the samples of every value of every condition."""
-    none = np.zeros(0, np.intp)
-    apart = np.flatnonzero(np.diff(np.floor(s / APART), prepend=-1.0) > 0)  # the first one of each cell
-    apart = apart[np.diff(s[apart], prepend=-1.0) > APART / 2]
-    of = np.concatenate([none, *(np.full(len(each.share), k) for k, each in enumerate(measured))])
-    part = np.concatenate([none, *(np.arange(len(each.share)) for each in measured)])
+    parts = [(k, part) for k, each in enumerate(measured) for part in range(len(each.share))]
+    of, part = np.array(parts, np.intp).reshape(-1, 2).T
     share = np.concatenate([np.empty((0, len(s))), *(each.share for each in measured)])
-    return _Rows(of, part, s[None, apart], share[:, apart])
+    if (s[1:] - s[:-1] <= APART).any():
+        apart = np.flatnonzero(np.diff(np.floor(s / APART), prepend=-1.0) > 0)  # the first one of each cell
+        apart = apart[np.diff(s[apart], prepend=-1.0) > APART / 2]
+        s, share = s[apart], share[:, apart]
+    return _Rows(of, part, s[None], share)
 
 
 def _tops(s: Array, values: Array) -> Array:
     """Estimate from above how large functions are between neighbouring samples, shape (rows, K - 1)."""
     step, rise = s[:, 1:] - s[:, :-1], values[:, 1:] - values[:, :-1]
     slope = rise / step
-    bend = 2 * (slope[:, 1:] - slope[:, :-1]) / (step[:, 1:] + step[:, :-1])
-    around = bend[:, _neighbours(values.shape[1])]  # those at both ends of an interval, and beyond
-    low, high = around.min(axis=1), around.max(axis=1)
-    sag = np.maximum((high - 2 * low) * step**2 / 2, TINY)
+    bend = (slope[:, 1:] - slope[:, :-1]) / ((step[:, 1:] + step[:, :-1]) / 2)
+    around = np.concatenate([bend[:, :1], bend[:, :1], bend, bend[:, -1:], bend[:, -1:]], axis=1)
+    low, high = _of_four(np.minimum, around), _of_four(np.maximum, around)  # at both ends of an interval, and beyond
+    sag = np.maximum((high - 2 * low) * (step**2 / 2), TINY)
     over = np.maximum(sag - np.abs(rise), 0.0)
     return np.asarray(np.maximum(values[:, 1:], values[:, :-1]) + over**2 / (4 * sag))
 
 
-@lru_cache(maxsize=2)
-def _neighbours(count: int) -> Indices:
-    """For each interval between so many samples, which four second differences are around it, shape (4, count - 1)."""
-    return np.asarray(np.clip(np.arange(-2, 2)[:, None] + np.arange(count - 1), 0, count - 3))
+def _of_four(pick: np.ufunc, values: Array) -> Array:
+    """Return the least or the largest one of every four neighbours in a row."""
+    pairs = pick(values[:, 1:], values[:, :-1])
+    return np.asarray(pick(pairs[:, 2:], pairs[:, :-2]))

@@ -16,10 +16,11 @@ FEWEST = 200  # samples of a motion
 LONGEST = 2000.0  # s that a motion may take, whatever the step: half an hour
 MOST = 200_000  # samples in time, which take a second to look at: of longer motions they are further apart
 SPARE = 1.05  # so many times more samples than the step asks for: r varies inside a cell of the table of times
-CELLS, FEW_CELLS = 4096, 512  # of equal size in the table of times, and in that of a first look
+CELLS, FEW_CELLS = 4096, 128  # of equal size in the table of times, and in that of a first look
 PER_SPAN = 8  # samples between two knots, evenly in phase
 AT_ENDS = 64  # additional samples at each end
 END = 0.05  # how far from each end they reach, in phase
+APART = 1e-7  # in phase: of nearer samples one counts, since differences of their values are rounding
 FEW_PER_SPAN, FEW_AT_ENDS = 8, 16  # the same of a first look, which has no others
 
 
@@ -107,7 +108,8 @@ def few_phases(spans: int, also: frozenset[float] = frozenset()) -> Phases:
         spans: Number of intervals between the knots of the finer spline.
         also: Further phases.
     """
-    return Phases(np.unique(_phases(FEW_PER_SPAN * spans, FEW_AT_ENDS, also)))
+    s = np.unique(_phases(FEW_PER_SPAN * spans, FEW_AT_ENDS, also))
+    return Phases(s[np.diff(s, prepend=-1.0) > APART])
 
 
 def _phases(evenly: int, at_ends: int, also: Collection[float]) -> Array:

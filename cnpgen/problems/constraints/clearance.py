@@ -55,10 +55,11 @@ class RobotClearance(Constraint):
         """Measure the signed distances with Coal [m]."""
         shape = world.robot.shape
         if shape is None:
-            (found,) = self._clear(world.segment_distances(), [self.radius or 0.0])
+            radius = self.radius or 0.0
+            (found,) = self._clear(world.segment_distances(radius + self.distance), [radius])
             bodies = [f"segment {number}" for number, _ in enumerate(world.robot.skeleton, 1)]
         else:
-            (found,) = self._clear(world.shape_distances(), [0.0])
+            (found,) = self._clear(world.shape_distances(self.distance), [0.0])
             bodies = [piece.link for piece in shape.moving_pieces]
         return (replace(found, parts=tuple(f"{body}, {box.name}" for body in bodies for box in world.obstacles)),)
 
@@ -109,7 +110,7 @@ class ObjectContact(Constraint):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
-        return self._shallow(world.object_distances())
+        return self._shallow(world.object_distances(-self.depth))
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of what solvers see of the obstacles."""

@@ -36,7 +36,7 @@ class SelfClearance(Constraint):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the links' pieces with Coal [m]."""
-        (found,) = self._least(world.self_distances(), [0.0], sufficient=False)
+        (found,) = self._least(world.self_distances(self.distance), [0.0], sufficient=False)
         shape = world.robot.shape
         links = [piece.link for piece in shape.pieces] if shape else []
         pairs = shape.apart if shape else ()

@@ -8,7 +8,7 @@ table).
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -98,7 +98,7 @@ class TipManifold(Constraint):
         """Let a motion that starts off the manifold reach it: ``start_off`` until s = 0.1, nothing from s = 0.3 on."""
         if condition.name != self.held_name:
             return super().funnel(condition, s, start_tip)
-        open_: Array = np.clip((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0, 1.0)
+        open_: Array = np.minimum(np.maximum((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0), 1.0)
         return self.start_off(start_tip)[..., None] * open_
 
     def start_off(self, start_tip: Array) -> Array:
@@ -109,8 +109,8 @@ class TipManifold(Constraint):
         """
         place = self.place
         pairs = zip(place.held, place.height, strict=True)
-        off = np.stack([np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
-        return np.asarray(np.minimum(off.max(axis=0), self.band))
+        off = reduce(np.maximum, [np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
+        return np.asarray(np.minimum(off, self.band))
 
     def _position(self, tip: Sequence[Any], band: float) -> tuple[Condition, ...]:
         place = self.place
