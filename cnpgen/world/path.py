@@ -120,7 +120,8 @@ class PathWorld:
 
         if self._torque is None:
             q, dq, ddq = (np.asfortranarray(values) for values in (self.q, self.dq, self.ddq))
-            self._torque = np.array(pin.rneaInParallel(1, self._pool, q, dq, ddq))
+            found = pin.rneaInParallel(1, self._pool, q, dq, ddq)
+            self._torque = np.array(found).reshape(self.q.shape)  # of one joint Pinocchio returns a list of numbers
         return self._torque
 
     @property

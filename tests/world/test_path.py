@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.interpolate import BSpline
 
@@ -15,6 +16,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.motion import Motion
 from cnpgen.world.path import PathWorld
 from cnpgen.world.state import World
+from tests.examples.chains import chain
 
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
 ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
@@ -227,3 +229,13 @@ def test_a_motion_is_scipys_spline_of_its_control_points(label):
         states.ddq[0], (-q[0] + 16 * q[1] - 30 * q[2] + 16 * q[3] - q[4]) / (12 * h**2), atol=1e-3
     )
     np.testing.assert_allclose(motion.time_at(np.sort(phase(t)[0]))[0], t, atol=1e-10)
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+def test_arms_of_few_joints_have_a_row_of_torques_for_each(joints: int, tmp_path: Path) -> None:
+    robot = load_robot(chain(tmp_path, joints, jerk=False))
+    states, data = np.random.default_rng(0).normal(size=(3, joints, 7)), robot.model.createData()
+    world = PathWorld(robot, (), None)
+    world.set_path(*states, np.zeros(0))
+    expected = [pin.rnea(robot.model, data, *(values[:, k].copy() for values in states)) for k in range(7)]
+    np.testing.assert_allclose(world.torque, np.transpose(expected), atol=1e-12)
