@@ -65,8 +65,9 @@ def _unknown(path: Path, name: str, fields: Mapping[str, Field]) -> str:
 
 def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array], *, flat: bool) -> Array:
     """Join the components of a field; a position on a table needs no height."""
-    missing = [column for column in field.columns if column not in parts]
-    if missing and not (flat and field.name.endswith("_xyz") and missing == [f"{field.name}.z"]):
+    without = {f"{field.name}.z"} if flat and field.name.endswith("_xyz") else set()
+    missing = [column for column in field.columns if column not in {*parts, *without}]
+    if missing:
         raise DatasetError(f"{path} lacks {', '.join(missing)} beside {', '.join(parts)}")
     return np.stack([columns[name] for name in parts], axis=1)
 

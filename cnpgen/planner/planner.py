@@ -18,7 +18,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.strike import MEETING, State, Strikes, boundary_of_tasks, load_completion, strike_tasks
 from cnpgen.plans.boundary_file import CONTEXT
-from cnpgen.plans.plans import Plans
+from cnpgen.plans.plans import Plans, check_made, check_plans_type
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.arguments import numbers
@@ -193,7 +193,7 @@ class Planner:
         differ by more than 0.1 % of the limits, all plans that are returned have two or three spans for each of theirs.
 
         Args:
-            plans: One plan or N, by any planner of the same robot.
+            plans: One plan or N, by any planner of the same robot; one may be left for several goals.
             time: When the new plans take over, since the start of the old ones [s], one number or shape (N,). Planning
                 itself takes time: choose a moment that is still to come.
             goal_q: New goal positions [rad], shape (n,) or (N, n).
@@ -201,11 +201,17 @@ class Planner:
             goal_ddq: New goal accelerations [rad/s^2], as for ``plan``.
 
         Raises:
-            UsageError: There are not as many times as plans, one is not within its plan, or as for ``plan``.
+            UsageError: There are not as many times as plans, one is not within its plan, they are of another robot, or
+                as for ``plan``.
         """
+        check_plans_type(plans)
+        if plans.problem.joint_names != self.model.problem.joint_names:
+            raise UsageError(f"the planner is of {self.model.problem.name!r}, the plans are of {plans.problem.name!r}")
         q, dq, ddq = states_at(plans, time)
         new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq, goal_ddq=goal_ddq)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
+        if len(plans) == 1:
+            plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))
         return keep_what_is_faster(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
     def _accepted(self, boundary: Boundary) -> Boundary:
@@ -254,9 +260,8 @@ def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
     outside = ~((times >= 0) & (times <= plans.duration))
     if outside.any():
         row = int(outside.argmax())
-        if np.isnan(plans.path_control_points[row]).all():
-            raise UsageError(f"plan {row} has no control points yet: solve_plans(plans) makes them")
+        check_made(plans)
         raise UsageError(
-            f"plan {row} lasts from 0 to {plans.duration[row]:.6g} s, it cannot be evaluated at {times[row]:.6g} s"
+            f"plan {row} lasts from 0 to {plans.duration[row]:.9g} s, it cannot be evaluated at {times[row]:.9g} s"
         )
     return states_at_times(plans.motion, times)

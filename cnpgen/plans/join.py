@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.plans import Plans, check_made, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.record import ProblemRecord
 from cnpgen.schema.arguments import numbers
@@ -76,7 +76,7 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
 
     Raises:
         UsageError: There are not as many plans or times, they are of different problems, a time is not within its plan,
-            or there is a jump; the message says how large it is.
+            one is still to be made, or there is a jump; the message says how large it is.
     """
     joined = first if isinstance(first, JoinedPlans) else _alone(first)
     check_plans_type(following)
@@ -85,6 +85,7 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
     if following.problem.comparable_sha256 != joined.problem.comparable_sha256:
         differs = ", ".join(following.problem.differences(joined.problem)[:4])
         raise UsageError(f"plans of {joined.problem.name!r} and {following.problem.name!r} differ in {differs}")
+    check_made(following)
     try:
         begins = joined.duration if at is None else np.broadcast_to(numbers("at", at), (len(joined),))
     except ValueError as error:
@@ -96,4 +97,5 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
 
 def _alone(plans: Plans) -> JoinedPlans:
     check_plans_type(plans)
+    check_made(plans)
     return JoinedPlans((plans,), np.zeros((1, len(plans))))

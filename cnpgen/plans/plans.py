@@ -181,6 +181,17 @@ def check_plans_type(plans: Any) -> None:
         raise UsageError(f"expected Plans, as load_plans and make_plans return them, got {type(plans).__name__}")
 
 
+def check_made(plans: Plans) -> None:
+    """Refuse plans that are still to be made.
+
+    Raises:
+        UsageError: One has no control points.
+    """
+    waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
+    if waiting.any():
+        raise UsageError(f"plan {int(waiting.argmax())} has no control points yet: solve_plans(plans) makes them")
+
+
 def screen(plans: Plans) -> NDArray[np.uint8]:
     """Find the plans that cannot be evaluated at all.
 

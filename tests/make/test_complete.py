@@ -97,7 +97,7 @@ def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
         ("", "is empty: its first line must name columns"),
         ("goal_xyz.x,goal_xyz.w\n1,2\n", "cannot give 'goal_xyz.w' (did you mean 'goal_xyz."),
         ("colour,goal_xyz.y\n1,2\n", "cannot give 'colour', only start_xyz, goal_xyz, start_q"),
-        ("goal_xyz.y,hit_angle\n1,2\n", "lacks goal_xyz.x, goal_xyz.z beside goal_xyz.y"),
+        ("goal_xyz.y,hit_angle\n1,2\n", "lacks goal_xyz.x beside goal_xyz.y"),
         ("start_q.joint_1,goal_xyz.x,goal_xyz.y\n1,2,3\n", "lacks start_q.joint_2"),
         ("goal_xyz.x,goal_xyz.y\n1,2,3\n", "line 2 has 3 values, the first line names 2 columns"),
         ("goal_xyz.x,goal_xyz.y\n1,2\n\n1,left\n", "line 4: goal_xyz.y must be a number, got 'left'"),

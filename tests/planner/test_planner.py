@@ -11,6 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.join import join_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.plans import refine_plans
 from cnpgen.trajectory.boundary import Boundary
@@ -92,6 +93,26 @@ def test_a_goal_that_has_moved_is_planned_by_the_network_alone(planner, rows):
     for shift in (1e-6, 0.1):
         new = planner.replan(old, when, goal_q=rows.goal_q + shift, goal_dq=rows.goal_dq)
         np.testing.assert_array_equal(new.path_control_points, planner.plan_batch(new.boundary).path_control_points)
+
+
+def test_one_plan_is_left_for_several_goals_its_own_among_them(planner, rows):
+    old = planned(planner, rows)[:1]
+    new = planner.replan(old, 0.5 * old.duration, goal_q=rows.goal_q[:3], goal_dq=rows.goal_dq[:3])
+    assert len(new) == 3
+    for row, each in enumerate(new[[k]] for k in range(3)):
+        alone = planner.replan(old, 0.5 * old.duration, goal_q=rows.goal_q[row], goal_dq=rows.goal_dq[row])
+        np.testing.assert_allclose(each.duration, alone.duration, rtol=1e-7)
+
+
+def test_what_cannot_be_replanned_is_refused(planner, rows):
+    old, goal = planned(planner, rows), {"goal_q": rows.goal_q, "goal_dq": rows.goal_dq}
+    with pytest.raises(UsageError, match=r"expected Plans, .* got Boundary"):
+        planner.replan(rows, 0.1, **goal)
+    joined = join_plans(old, planner.replan(old, 0.5 * old.duration, **goal), at=0.5 * old.duration)
+    with pytest.raises(UsageError, match=r"expected Plans, .* got JoinedPlans"):
+        planner.replan(joined, 0.1, **goal)
+    with pytest.raises(UsageError, match="the planner is of 'airhockey', the plans are of 'heavy-object'"):
+        planner.replan(draw_boundary_problems("heavy-object", 2, seed=1), 0.0, **goal)
 
 
 def test_replanning_goes_on_without_a_jump_in_position_velocity_or_acceleration(planner, rows):

@@ -18,6 +18,10 @@ from cnpgen.plans.save import save_plans
 from cnpgen.plans.status import PlanStatus
 
 
+def unsolved(plans: Plans) -> Plans:
+    return replace(plans, path_control_points=np.full_like(plans.path_control_points, np.nan))
+
+
 @pytest.fixture(scope="module")
 def planner() -> Planner:
     return Planner("airhockey-replan")
@@ -82,10 +86,10 @@ def test_a_jump_is_refused_with_its_size_place_and_time(three):
     moved[1, 2] += 1e-8  # the third control point decides the acceleration alone
     with pytest.raises(UsageError, match=r"plan 1 cannot be joined: ddq jumps by .* rad/s\^2"):
         join_plans(first, replace(second, path_control_points=moved), at=switch)
-    with pytest.raises(UsageError, match="plan 2 cannot be joined: q jumps by"):
-        join_plans(
-            first, replace(second, path_control_points=np.where([[[0]], [[0]], [[1]]], np.nan, moved)), at=switch
-        )
+    moved = second.path_control_points.copy()
+    moved[2, 0, 0] = np.nan
+    with pytest.raises(UsageError, match="plan 2 cannot be joined: q jumps by nan"):
+        join_plans(first, replace(second, path_control_points=moved), at=switch)
 
 
 @pytest.mark.parametrize(
@@ -96,6 +100,8 @@ def test_a_jump_is_refused_with_its_size_place_and_time(three):
         (lambda first, second, at: (first, second, 60.0), r"plan 0 cannot be cut at 60 s: what is cut lasts from 0 to"),
         (lambda first, second, at: (first, second, -0.1), r"plan 0 cannot be cut at -0.1 s"),
         (lambda first, second, at: (first, "plans.h5", at), "expected Plans"),
+        (lambda first, second, at: (first, unsolved(second), at), "plan 0 has no control points yet"),
+        (lambda first, second, at: (unsolved(first), second, at), "plan 0 has no control points yet"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(three, change, message):
