@@ -122,8 +122,6 @@ class Refiner:
             return
         if given is not None and self.coarser is not None:
             yield from self._by_coarser(self.coarser, task, given)
-            if self.check.refutes_ends(task):
-                return
         repaired = self._measured(task, given, Outcome.ADJUSTED) if given is not None and task.at_rest else None
         best = yield from self._passes(task, given, repaired)
         if self.check.refutes_ends(task):

@@ -91,6 +91,8 @@ def test_where_the_problem_has_too_few_control_points_the_plan_is_refined_with_i
     motion = tool.check.transcription(task(plan))
     path, rate = motion.unpack(tool.straight(task(plan)))
     assert refined(plan, tool, task(plan, path=path, rate=rate)).valid
+    beyond = replace(plan.boundary, goal_dq=plan.boundary.goal_dq + 100)  # faster than any joint may be
+    assert not refined(plan, tool, task(plan, beyond, path=path, rate=rate)).valid
 
 
 def test_before_a_deadline_steps_with_all_control_points_are_known_to_take_longer(
