@@ -29,6 +29,7 @@ from cnpgen.kernels.kernel import Array, Kernel, check_arguments
 from cnpgen.kernels.tape import Tape
 
 CALL = Path(__file__).with_name("call.c")
+LINE = 8  # numbers in a line of the cache
 LONG = 6000  # instructions: above, GCC's register allocator takes minutes at -O2 and gains nothing
 _LOG = logging.getLogger(__name__)
 
@@ -127,6 +128,12 @@ def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
 def _array_type(kind: Any, count: int) -> Any:
     """Return ``kind * count``; ctypes makes the type anew, in several microseconds, where nobody keeps it."""
     return kind * count
+
+
+def aligned(count: int) -> Array:
+    """Return memory for so many numbers, from where a line of the cache begins, and with it a vector of any width."""
+    found = np.empty(count + LINE)
+    return found[-address_of(found) // found.itemsize % LINE :][:count]
 
 
 def address_of(array: Any) -> int:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.kernels.symbolic.state import SymbolicState, jerk_along
-from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.problems.constraints.constraint import FINEST, Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-FINEST = 1e-9  # a tolerance of zero is taken for this
 
 
 def equality_residuals(robot: "Robot", problem: Problem) -> Any:
@@ -71,9 +70,7 @@ def speed_excess(robot: "Robot", problem: Problem) -> Any:
     out: list[Any] = []
     for condition, needs in _conditions(robot, problem, state, tops):
         if needs:
-            for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True):
-                out += [float(low) - value] if np.isfinite(low) else []
-                out += [value - float(high)] if np.isfinite(high) else []
+            out += _beyond(condition, np.ones(len(condition.g)))
     worst = reduce(ca.fmax, out) if out else ca.SX(-1)
     return ca.Function("speed_excess", [ca.vertcat(*columns)], [worst])
 
@@ -119,11 +116,17 @@ def rest_excess(robot: "Robot", problem: Problem) -> Any:
     out: list[Any] = []
     for constraint in problem.constraint:
         for condition in constraint.symbolic(state):
-            allowed = np.maximum(constraint.allowed(condition), FINEST)
-            for value, low, high, unit in zip(condition.g, condition.lower, condition.upper, allowed, strict=True):
-                out += [(float(low) - value) / float(unit)] if np.isfinite(low) else []
-                out += [(value - float(high)) / float(unit)] if np.isfinite(high) else []
+            out += _beyond(condition, np.maximum(constraint.allowed(condition), FINEST))
     return ca.Function("rest_excess", [q_sx, tops_sx], [reduce(ca.fmax, out, ca.SX(-1))])
+
+
+def _beyond(condition: Condition, units: Array) -> list[Any]:
+    """Return by how many units, shape (m,), the values of a condition are beyond each of its finite bounds."""
+    found = []
+    for value, low, high, unit in zip(condition.g, condition.lower, condition.upper, units.tolist(), strict=True):
+        found += [(float(low) - value) / unit] if np.isfinite(low) else []
+        found += [(value - float(high)) / unit] if np.isfinite(high) else []
+    return found
 
 
 def useful_steps(kernels: KernelLibrary, steps: int) -> int:

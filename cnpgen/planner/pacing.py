@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.kernels.compiled import address_of
+from cnpgen.kernels.compiled import address_of, aligned
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
@@ -165,8 +165,7 @@ def span_of(table: Array) -> NDArray[np.int64]:
 
 def by_point(table: Array) -> Array:
     """Lay out a basis as pace.c takes it, shape (orders, points, K), from where a vector may begin."""
-    found = np.empty(table.size + VECTOR)
-    found = found[-address_of(found) // found.itemsize % VECTOR :][: table.size]
+    found = aligned(table.size)
     found.reshape(table.swapaxes(1, 2).shape)[:] = table.swapaxes(1, 2)
     return found
 

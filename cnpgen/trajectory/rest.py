@@ -18,7 +18,7 @@ from cnpgen.trajectory.spline import basis, chebyshev
 Array = NDArray[np.float64]
 
 FAITHFUL = 1e-3  # of the acceleration limits: what accelerations may differ by; tolerances of problems are larger
-FINEST = 3  # spans in the place of one; then accelerations of motions at their limits differ by 0.5 % at most
+MOST_SPANS = 3  # spans in the place of one; then accelerations of motions at their limits differ by 0.5 % at most
 LOOKS = 64  # moments at which accelerations are compared
 
 
@@ -39,7 +39,7 @@ def rest_of(motion: Motion, t: Array, boundary: Boundary, *, spec: TrajectorySpe
     left = motion.duration() - t
     moments = left[:, None] * np.linspace(0, 1, LOOKS)
     wanted = motion.at_times(t[:, None] + moments).ddq
-    for spans in range(1, FINEST + 1):
+    for spans in range(1, MOST_SPANS + 1):
         found = _written(motion, t, left, boundary, finer(spec, spans))
         off = np.abs(found.at_times(moments).ddq - wanted) / acceleration_limit
         if off.max(initial=0.0) <= FAITHFUL:
@@ -57,7 +57,7 @@ def finer(spec: TrajectorySpec, spans: int) -> TrajectorySpec:
 
 def is_finer(spec: TrajectorySpec, than: TrajectorySpec) -> bool:
     """Whether a spec has two or three spans in the place of each of another one."""
-    return spec in {finer(than, spans) for spans in range(2, FINEST + 1)}
+    return spec in {finer(than, spans) for spans in range(2, MOST_SPANS + 1)}
 
 
 def with_fewer_knots(motion: Motion, boundary: Boundary, spec: TrajectorySpec) -> Motion:

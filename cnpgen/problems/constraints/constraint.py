@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 End = Literal["start", "goal"]
 
+FINEST = 1e-9  # what solvers and planners take a tolerance of zero for
+
 # How exactly a boundary state must meet its conditions, by the type that it is stored in. Limits are relative, the
 # rest is SI.
 EXACTNESS: dict[str, dict[str, float]] = {

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.compiled import address_of
+from cnpgen.kernels.compiled import LINE, address_of, aligned
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.criterion import ROUNDED
@@ -37,7 +37,6 @@ Array = NDArray[np.float64]
 
 SOURCES = [Path(__file__).with_name(name) for name in ("nearest.c", "step.c")]
 WIDEST, BLOCK, TILE = 8, 32, 8  # at least as many as step.c's W, B and TILE
-LINE = 8  # numbers in a line of the cache
 
 
 class _Bases(ctypes.Structure):
@@ -219,10 +218,9 @@ class CompiledSteps:
     def _room(self, sizes: Sequence[int]) -> list[int]:
         """Return addresses of memory for so many numbers each, at beginnings of the cache's lines."""
         lines = [size + -size % LINE for size in sizes]
-        array = np.empty(sum(lines) + LINE)
+        array = aligned(sum(lines))
         self._kept.append(array)
         begin = address_of(array)
-        begin += -begin % (LINE * array.itemsize)
         return [begin + array.itemsize * before for before in accumulate(lines, initial=0)][:-1]
 
     def _bases(self, bases: Bases) -> _Bases:

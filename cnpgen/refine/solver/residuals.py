@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.state import HeldState, jerk_along
+from cnpgen.problems.constraints.constraint import FINEST
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import count_numbers
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 DISTANCE = 0.1  # m
 TOLERANCES = 20
-FINEST = 1e-9  # a tolerance of zero is taken for this
 
 
 def stage_values(robot: "Robot", problem: Problem) -> Any:
